@@ -1,0 +1,96 @@
+"""The trajectory: what planners return and warm starts are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from freeflyer_env import constraints, dynamics
+from freeflyer_env.robot import FloatArray
+from freeflyer_env.scenario import Problem
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """States and controls on the nodes of the optimal control problem.
+
+    Attributes:
+        states: ``(N + 1, 6)`` states before each impulse, and after the last one (SI, global frame).
+        controls: ``(N, 3)`` impulses per unit mass ``(dv_x, dv_y, h)``.
+        dt: Step in s.
+    """
+
+    states: FloatArray
+    controls: FloatArray
+    dt: float
+
+    def __post_init__(self) -> None:
+        states = np.asarray(self.states, dtype=np.float64)
+        controls = np.asarray(self.controls, dtype=np.float64)
+        if states.ndim != 2 or states.shape[1] != 6 or controls.shape != (len(states) - 1, 3):
+            raise ValueError(
+                "A Trajectory needs states (N + 1, 6) and controls (N, 3), got "
+                f"{states.shape} and {controls.shape}."
+            )
+        object.__setattr__(self, "states", states)
+        object.__setattr__(self, "controls", controls)
+
+    @classmethod
+    def from_controls(cls, problem: Problem, controls: FloatArray) -> Trajectory:
+        """The trajectory that ``controls`` ``(N, 3)`` produce from the problem's start."""
+        dt, robot = problem.scenario.dt, problem.scenario.robot
+        return cls(dynamics.rollout(problem.start, controls, dt, robot), controls, dt)
+
+    @classmethod
+    def from_poses(
+        cls, problem: Problem, poses: FloatArray, *, with_controls: bool = False
+    ) -> Trajectory:
+        """A warm start through the poses ``(N, 3)`` of the nodes; the ends are the problem's.
+
+        Args:
+            problem: Gives start, goal and step.
+            poses: ``(r_x, r_y, psi)`` at each node.
+            with_controls: Whether the controls are those that the poses imply (they may exceed the
+                actuation limit), or zero.
+        """
+        poses = np.array(poses, dtype=np.float64)
+        poses[0], poses[-1] = problem.start[:3], problem.goal[:3]
+        dt, robot = problem.scenario.dt, problem.scenario.robot
+        rates = np.vstack([problem.start[3:], np.diff(poses, axis=0) / dt, problem.goal[3:]])
+        states = np.hstack([np.vstack([poses, poses[-1:]]), rates])
+        controls = np.zeros((len(poses), 3))
+        if with_controls:
+            controls = np.diff(rates, axis=0) / robot.control_gain
+        return cls(states, controls, dt)
+
+    @property
+    def n_steps(self) -> int:
+        return len(self.controls)
+
+    @property
+    def times(self) -> FloatArray:
+        """``(N + 1,)`` times of the states in s; the last impulse acts at ``(N - 1) dt``."""
+        return self.dt * np.arange(self.n_steps + 1)
+
+    @property
+    def cost(self) -> float:
+        """``sum_i ||u_i||_1``, the objective (paper, eq. 4a)."""
+        return float(np.abs(self.controls).sum())
+
+    def rewards(self) -> FloatArray:
+        """``(N,)`` rewards ``r_i = -||u_i||_1``."""
+        return -np.abs(self.controls).sum(axis=1)
+
+    def violations(self, problem: Problem) -> FloatArray:
+        """``(N,)`` constraint indicator ``C(t_i)`` (paper, eq. 6)."""
+        return constraints.violations(problem.scenario, self.states, self.controls)
+
+    def check(self, problem: Problem) -> constraints.ConstraintReport:
+        """Largest violation of each family of constraints."""
+        return constraints.check(problem, self.states, self.controls)
+
+
+def to_go(values: FloatArray) -> FloatArray:
+    """Sums from each index to the end: rewards to returns-to-go (paper, eq. 5), along the last axis."""
+    return np.cumsum(np.asarray(values)[..., ::-1], axis=-1)[..., ::-1]

@@ -1,0 +1,154 @@
+"""The free-flyer robot: mass properties, thruster geometry and allocation.
+
+The body frame has its origin at the centre of mass, ``e_x`` forward and ``e_y`` to the left::
+
+              (2) e_y (1)
+             <--   ^   -->            body wrench, with d_i in [0, 1] the duty of thruster i:
+            ^  |   |   |  ^             F_x = T ((d2 + d5) - (d1 + d6))
+        (3) |--o-------o--| (0)         F_y = T ((d4 + d7) - (d0 + d3))
+               |       | ---> e_x       M   = b T ((d1 + d3 + d5 + d7) - (d0 + d2 + d4 + d6))
+        (4) |--o-------o--| (7)
+            v  |       |  v
+             <--       -->            (arrows show the exhaust; the push is opposite)
+              (5)     (6)
+
+The eight thrusters form four opposed pairs, the *clusters* ``(7-0, 2-1, 4-3, 5-6)``: a cluster's signed
+delta-V is positive when its first thruster fires.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+
+#: For each cluster the thruster that pushes it forwards and the one that pushes it backwards.
+CLUSTER_THRUSTERS = ((7, 0), (2, 1), (4, 3), (5, 6))
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A planar spacecraft robot with eight on/off thrusters (paper, Sec. IV-A).
+
+    Attributes:
+        mass: Mass in kg.
+        inertia: Moment of inertia about the vertical axis in kg m^2.
+        radius: Radius of the (disc-shaped) hull in m.
+        thrust: Thrust of each thruster in N.
+        lever_arm: Distance of each thruster's line of action from the centre of mass in m.
+    """
+
+    mass: float = 16.0
+    inertia: float = 0.18
+    radius: float = 0.15
+    thrust: float = 0.2
+    lever_arm: float = 0.11461
+
+    def __post_init__(self) -> None:
+        for name in ("mass", "inertia", "radius", "thrust", "lever_arm"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0.0):
+                raise ValueError(f"Robot.{name} must be a positive finite number, got {value!r}.")
+        if self.lever_arm > self.radius:
+            raise ValueError(
+                f"Robot.lever_arm must be at most the radius ({self.radius} m), got {self.lever_arm}."
+            )
+
+    @property
+    def mass_over_inertia(self) -> float:
+        """``m / J`` in 1/m^2: turns the angular impulse per unit mass ``h`` into a rate change."""
+        return self.mass / self.inertia
+
+    @cached_property
+    def control_gain(self) -> FloatArray:
+        """``(3,)`` gain from a control ``(dv_x, dv_y, h)`` to the change of ``(v_x, v_y, omega)``."""
+        return np.array([1.0, 1.0, self.mass_over_inertia])
+
+    def delta_v_max(self, dt: float) -> float:
+        """Largest delta-V of one thruster in a step of ``dt`` seconds, in m/s: ``T dt / m``."""
+        return self.thrust * dt / self.mass
+
+    @cached_property
+    def thruster_positions(self) -> FloatArray:
+        """Thruster positions on the hull's rim in the body frame, ``(8, 2)`` in m."""
+        b = self.lever_arm
+        a = float(np.sqrt(self.radius**2 - b**2))
+        return np.array([(b, a), (a, b), (-a, b), (-b, a), (-b, -a), (-a, -b), (a, -b), (b, -a)])
+
+    @cached_property
+    def thruster_directions(self) -> FloatArray:
+        """Unit direction in which each thruster pushes the robot, body frame, ``(8, 2)``."""
+        return np.array(
+            [(0, -1), (-1, 0), (1, 0), (0, -1), (0, 1), (1, 0), (-1, 0), (0, 1)], dtype=np.float64
+        )
+
+    @cached_property
+    def wrench_matrix(self) -> FloatArray:
+        """Maps duties ``(8,)`` to the body wrench ``(F_x, F_y, M)`` in N, N, N m: ``(3, 8)``."""
+        r, d = self.thruster_positions, self.thruster_directions
+        torque = r[:, 0] * d[:, 1] - r[:, 1] * d[:, 0]
+        return self.thrust * np.column_stack([d, torque]).T
+
+    @cached_property
+    def cluster_matrix(self) -> FloatArray:
+        """``Lambda``: cluster delta-Vs ``(4,)`` to the body control ``(dv_x, dv_y, h)``, ``(3, 4)``."""
+        b = self.lever_arm
+        return np.array([[0, 1, 0, 1], [1, 0, 1, 0], [b, -b, -b, b]], dtype=np.float64)
+
+    @cached_property
+    def cluster_inverse(self) -> FloatArray:
+        """Pseudo-inverse of :attr:`cluster_matrix`, ``(4, 3)``, used by the OCP's actuation limit."""
+        q = 0.25 / self.lever_arm
+        return np.array([[0, 0.5, q], [0.5, 0, -q], [0, 0.5, -q], [0.5, 0, q]])
+
+    def cluster_delta_v(self, psi: FloatArray | float, control: FloatArray) -> FloatArray:
+        """Cluster delta-Vs that the pseudo-inverse assigns to a global control (paper, eq. 4g).
+
+        Args:
+            psi: Heading in rad, any batch shape ``(...)``.
+            control: ``(..., 3)`` controls ``(dv_x, dv_y, h)`` in m/s, m/s, m^2/s, global frame.
+
+        Returns:
+            ``(..., 4)`` signed delta-Vs in m/s.
+        """
+        control = np.asarray(control, dtype=np.float64)
+        cos, sin = np.cos(psi), np.sin(psi)
+        body = np.stack(
+            [
+                cos * control[..., 0] + sin * control[..., 1],
+                -sin * control[..., 0] + cos * control[..., 1],
+                control[..., 2],
+            ],
+            axis=-1,
+        )
+        return body @ self.cluster_inverse.T
+
+    def allocate(self, wrench_body: FloatArray) -> FloatArray:
+        """Thruster duties that realise a body wrench as nearly as the thrusters can.
+
+        The four clusters have one internal degree of freedom; it is used to minimise the largest duty,
+        so every realisable wrench is met exactly. A wrench beyond reach is scaled down, its direction
+        kept.
+
+        Args:
+            wrench_body: ``(..., 3)`` force and torque ``(F_x, F_y, M)`` in N, N, N m, body frame.
+
+        Returns:
+            ``(..., 8)`` duties in [0, 1].
+        """
+        clusters = np.asarray(wrench_body, dtype=np.float64) @ self.cluster_inverse.T / self.thrust
+        null = np.array([1.0, 1.0, -1.0, -1.0])
+        signed = clusters * null
+        middle = 0.5 * (signed.max(axis=-1) + signed.min(axis=-1))
+        clusters = clusters - middle[..., None] * null
+        largest = np.abs(clusters).max(axis=-1, keepdims=True)
+        clusters = clusters / np.maximum(largest, 1.0)
+        duties = np.zeros((*clusters.shape[:-1], 8))
+        for index, (forward, backward) in enumerate(CLUSTER_THRUSTERS):
+            duties[..., forward] = np.maximum(clusters[..., index], 0.0)
+            duties[..., backward] = np.maximum(-clusters[..., index], 0.0)
+        return duties

@@ -1,0 +1,349 @@
+"""Scenes and problems: what the robot is asked to do, and where.
+
+A :class:`Scenario` is the table with its disc obstacles and the robot on it; a :class:`Problem` adds a
+start, a goal and a final time. The paper's scenes are in :data:`SCENES`, by name.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from freeflyer_env.robot import FloatArray, Robot
+
+#: Names of the six state components, in order.
+STATE_NAMES = ("r_x", "r_y", "psi", "v_x", "v_y", "omega")
+
+_ON_BOUNDARY = 1e-7  # m: float32 rounding of a start on the boundary is not a violation
+
+
+@dataclass(frozen=True, eq=False)
+class Obstacles:
+    """Disc obstacles, fixed to the table.
+
+    Attributes:
+        centres: ``(M, 2)`` centres in m, table frame.
+        radii: ``(M,)`` radii in m.
+    """
+
+    centres: FloatArray
+    radii: FloatArray
+
+    def __post_init__(self) -> None:
+        centres = np.asarray(self.centres, dtype=np.float64).reshape(-1, 2)
+        radii = np.asarray(self.radii, dtype=np.float64).reshape(-1)
+        if len(centres) != len(radii):
+            raise ValueError(
+                f"Obstacles need one radius per centre, got {len(centres)} centres, {len(radii)} radii."
+            )
+        if not (np.isfinite(centres).all() and np.isfinite(radii).all()):
+            raise ValueError("Obstacles must be finite numbers; check centres and radii for NaN.")
+        if (radii <= 0.0).any():
+            raise ValueError(f"Obstacles.radii must be positive, got {radii.tolist()}.")
+        centres.setflags(write=False)
+        radii.setflags(write=False)
+        object.__setattr__(self, "centres", centres)
+        object.__setattr__(self, "radii", radii)
+
+    def __len__(self) -> int:
+        return len(self.radii)
+
+    @classmethod
+    def from_rows(cls, rows: ArrayLike) -> Obstacles:
+        """Obstacles from ``(M, 3)`` rows ``(x, y, radius)``; rows of radius zero are padding."""
+        table = np.asarray(rows, dtype=np.float64).reshape(-1, 3)
+        table = table[table[:, 2] != 0.0]
+        return cls(table[:, :2].copy(), table[:, 2].copy())
+
+    def rows(self) -> FloatArray:
+        """``(M, 3)`` rows ``(x, y, radius)`` in m."""
+        return np.column_stack([self.centres, self.radii])
+
+
+def _default_obstacles() -> Obstacles:
+    return SCENES["nominal"]
+
+
+@dataclass(frozen=True, eq=False)
+class Scenario:
+    """The table, its obstacles and the robot.
+
+    Attributes:
+        obstacles: The discs on the table.
+        robot: The robot.
+        table: Size of the table ``(x, y)`` in m; its lower left corner is the origin.
+        dt: Step of the optimal control problem in s.
+        keep_out_factor: The keep-out radius is ``(R_obstacle + R_robot) * keep_out_factor``.
+    """
+
+    obstacles: Obstacles = field(default_factory=_default_obstacles)
+    robot: Robot = field(default_factory=Robot)
+    table: tuple[float, float] = (3.5, 2.5)
+    dt: float = 0.5
+    keep_out_factor: float = 1.1
+
+    def __post_init__(self) -> None:
+        if not all(np.isfinite(side) and side > 2 * self.robot.radius for side in self.table):
+            raise ValueError(
+                f"Scenario.table must be wider than the robot (2 x {self.robot.radius} m) "
+                f"in both directions, got {self.table}."
+            )
+        if not (np.isfinite(self.dt) and self.dt > 0.0):
+            raise ValueError(f"Scenario.dt must be positive, got {self.dt}.")
+        if not (np.isfinite(self.keep_out_factor) and self.keep_out_factor >= 1.0):
+            raise ValueError(
+                f"Scenario.keep_out_factor must be at least 1, got {self.keep_out_factor}."
+            )
+
+    @property
+    def keep_out_radii(self) -> FloatArray:
+        """``(M,)`` radii in m that the robot's centre stays out of."""
+        return (self.obstacles.radii + self.robot.radius) * self.keep_out_factor
+
+    @property
+    def position_limits(self) -> tuple[FloatArray, FloatArray]:
+        """Lower and upper limit ``(2,)`` of the robot's centre in m."""
+        margin = self.robot.radius
+        return np.full(2, margin), np.asarray(self.table) - margin
+
+    @classmethod
+    def named(cls, name: str) -> Scenario:
+        """The scenario of one of the paper's scenes.
+
+        Raises:
+            ValueError: If there is no such scene; the message names the nearest one.
+        """
+        if name not in SCENES:
+            near = difflib.get_close_matches(name, SCENES, n=1)
+            hint = f" Did you mean {near[0]!r}?" if near else ""
+            raise ValueError(f"No scene is called {name!r}.{hint} Known: {', '.join(SCENES)}.")
+        return cls(obstacles=SCENES[name])
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One trajectory optimisation problem: from ``start`` to ``goal`` in ``final_time`` seconds.
+
+    Attributes:
+        scenario: Table, obstacles and robot.
+        start: ``(6,)`` state at time zero, SI units, global frame.
+        goal: ``(6,)`` state after the last impulse. Headings are not periodic: the shortest turn is
+            asked for by a goal heading within pi of the start's (see :func:`unwrap_goal`).
+        final_time: Final time in s, a whole number (at least two) of steps ``dt``.
+
+    Raises:
+        ValueError: On a wrong shape, a value that is not finite, or a final time that does not fit.
+            What only makes a well-formed problem unsolvable is told by :meth:`defects`.
+    """
+
+    scenario: Scenario
+    start: FloatArray
+    goal: FloatArray
+    final_time: float = 40.0
+
+    def __post_init__(self) -> None:
+        for name in ("start", "goal"):
+            value = np.array(getattr(self, name), dtype=np.float64)
+            if value.shape != (6,):
+                raise ValueError(
+                    f"Problem.{name} must be a state of 6 numbers {STATE_NAMES}, "
+                    f"got shape {value.shape}."
+                )
+            if not np.isfinite(value).all():
+                bad = STATE_NAMES[int(np.argmin(np.isfinite(value)))]
+                raise ValueError(f"Problem.{name} must be finite; {bad} is {value.tolist()}.")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        dt = self.scenario.dt
+        steps = self.final_time / dt
+        if not np.isfinite(steps) or steps < 2 or abs(steps - round(steps)) > 1e-6:
+            raise ValueError(
+                f"Problem.final_time must be a multiple of dt = {dt} s, at least {2 * dt} s; "
+                f"got {self.final_time} s."
+            )
+
+    @property
+    def n_steps(self) -> int:
+        """Number ``N`` of controls."""
+        return round(self.final_time / self.scenario.dt)
+
+    def defects(self) -> list[str]:
+        """Why no trajectory can solve this problem, one line per reason; empty if none is seen."""
+        lines = []
+        low, high = self.scenario.position_limits
+        for name, state in (("start", self.start), ("goal", self.goal)):
+            position = state[:2]
+            if (position < low - _ON_BOUNDARY).any() or (position > high + _ON_BOUNDARY).any():
+                lines.append(
+                    f"the {name} ({position[0]:.3f}, {position[1]:.3f}) m is off the table: the "
+                    f"centre must stay in x [{low[0]:g}, {high[0]:g}], y [{low[1]:g}, {high[1]:g}] m"
+                )
+            gaps = np.linalg.norm(position - self.scenario.obstacles.centres, axis=1)
+            for index, (gap, radius) in enumerate(zip(gaps, self.scenario.keep_out_radii)):
+                if gap < radius - _ON_BOUNDARY:
+                    lines.append(
+                        f"the {name} is inside the keep-out zone of obstacle {index}: {gap:.3f} m "
+                        f"from its centre, at least {radius:.3f} m needed; move one of them"
+                    )
+        return lines
+
+    def require_valid(self) -> Problem:
+        """Returns itself, or raises a ``ValueError`` with the :meth:`defects` in one line."""
+        if defects := self.defects():
+            raise ValueError(f"Invalid problem: {'; '.join(defects)}.")
+        return self
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers and lists, for JSON; :meth:`from_dict` is its inverse (default robot)."""
+        return {
+            "start": self.start.tolist(),
+            "goal": self.goal.tolist(),
+            "obstacles": self.scenario.obstacles.rows().tolist(),
+            "final_time": float(self.final_time),
+        }
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any], scenario: Scenario | None = None) -> Problem:
+        """Problem from a mapping with ``start``, ``goal``, ``obstacles`` and ``final_time``.
+
+        Args:
+            data: As :meth:`to_dict` gives it; an environment's first observation (with
+                ``state`` and ``time_to_go``) will do too.
+            scenario: Supplies robot, table and step; its obstacles are replaced.
+        """
+        data = dict(data)
+        if "state" in data:
+            data["start"] = data.pop("state")
+            data["final_time"] = float(np.asarray(data.pop("time_to_go")).item())
+        missing = {"start", "goal", "obstacles", "final_time"} - set(data)
+        if missing:
+            raise ValueError(f"A problem needs {sorted(missing)} too; got {sorted(data)}.")
+        scenario = replace(scenario or Scenario(), obstacles=Obstacles.from_rows(data["obstacles"]))
+        return cls(scenario, data["start"], data["goal"], float(data["final_time"]))
+
+
+def unwrap_goal(start: FloatArray, goal: FloatArray) -> FloatArray:
+    """The goal with its heading moved by whole turns to within pi of the start's."""
+    goal = np.array(goal, dtype=np.float64)
+    turn = goal[2] - start[2]
+    goal[2] = start[2] + (turn + np.pi) % (2 * np.pi) - np.pi
+    return goal
+
+
+def sample_obstacles(
+    rng: np.random.Generator,
+    n_obstacles: int = 4,
+    radius_range: tuple[float, float] = (0.1, 0.2),
+    table: tuple[float, float] = (3.5, 2.5),
+) -> Obstacles:
+    """Random discs that do not overlap, centres with x in [0.5, 3.0] m (paper, ART-Rs).
+
+    Args:
+        rng: Source of randomness.
+        n_obstacles: How many discs.
+        radius_range: Smallest and largest radius in m.
+        table: Size of the table in m.
+
+    Raises:
+        ValueError: If so many discs do not fit.
+    """
+    rows: list[FloatArray] = []
+    for _ in range(1000 * max(n_obstacles, 1)):
+        if len(rows) == n_obstacles:
+            break
+        radius = rng.uniform(*radius_range)
+        x = rng.uniform(0.5, table[0] - 0.5)
+        row = np.array([x, rng.uniform(radius, table[1] - radius), radius])
+        if all(np.hypot(*(row[:2] - other[:2])) > radius + other[2] for other in rows):
+            rows.append(row)
+    if len(rows) < n_obstacles:
+        raise ValueError(f"Could not place {n_obstacles} obstacles on the table; ask for fewer.")
+    return Obstacles.from_rows(np.array(rows).reshape(-1, 3))
+
+
+def sample_problem(
+    rng: np.random.Generator,
+    scenario: Scenario | None = None,
+    final_time: float = 40.0,
+    n_obstacles: int = 4,
+) -> Problem:
+    """A random problem: start region left, goal region right, headings uniform, both at rest.
+
+    Start and goal are free of keep-out zones; nothing else is promised, so some problems are hard and
+    a few have no solution. Values are exactly representable in float32, so that a problem read back
+    from an observation is the same problem.
+
+    Args:
+        rng: Source of randomness.
+        scenario: The scene; a new one with random obstacles if None (paper, ART-Rs).
+        final_time: Final time in s.
+        n_obstacles: Number of obstacles of a new scene.
+    """
+    if scenario is None:
+        base = Scenario(obstacles=Obstacles.from_rows([]))
+        obstacles = sample_obstacles(rng, n_obstacles, table=base.table)
+        rows = np.float32(obstacles.rows()).astype(np.float64)
+        scenario = replace(base, obstacles=Obstacles.from_rows(rows))
+    radius, (width, _) = scenario.robot.radius, scenario.table
+    start = _sample_state_at_rest(rng, scenario, (radius, 0.5 - radius))
+    goal = _sample_state_at_rest(rng, scenario, (width - 0.5 + radius, width - radius))
+    goal = np.float32(unwrap_goal(start, goal)).astype(np.float64)
+    return Problem(scenario, start, goal, final_time)
+
+
+def _sample_state_at_rest(
+    rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float]
+) -> FloatArray:
+    low, high = scenario.position_limits
+    for _ in range(10_000):
+        position = np.array([rng.uniform(*x_range), rng.uniform(low[1], high[1])])
+        psi = rng.uniform(-np.pi, np.pi)
+        position = np.clip(np.float32(position).astype(np.float64), low, high)
+        gaps = np.linalg.norm(position - scenario.obstacles.centres, axis=1)
+        if (gaps > scenario.keep_out_radii).all():
+            return np.array([*position, np.float32(psi), 0.0, 0.0, 0.0], dtype=np.float64)
+    raise ValueError(f"The obstacles leave no free place with x in {x_range} m; use other obstacles.")
+
+
+# Rows (x, y, radius) in m.
+# fmt: off
+_NOMINAL = ((1.0, 0.7, 0.2), (1.5, 1.7, 0.2), (2.5, 0.75, 0.2), (2.5, 1.75, 0.2))
+_TRAINING = (
+    ((2.5, 1.3, 0.13), (1.2, 1.2, 0.2), (2.0, 0.7, 0.16), (1.9, 1.75, 0.2)),
+    ((2.5, 1.9, 0.15), (1.7, 1.75, 0.2), (1.2, 0.9, 0.18), (2.2, 0.7, 0.12)),
+    ((1.6, 1.4, 0.17), (0.9, 1.75, 0.19), (2.5, 1.9, 0.14), (2.2, 0.7, 0.2)),
+    ((1.3, 0.7, 0.2), (2.6, 1.75, 0.19), (1.0, 1.9, 0.14), (1.9, 1.4, 0.17)),
+    ((1.3, 1.0, 0.16), (2.8, 1.3, 0.13), (2.2, 0.7, 0.2), (1.6, 1.75, 0.23)),
+    ((0.8, 0.5, 0.17), (1.3, 1.7, 0.2), (2.0, 1.05, 0.14), (2.6, 2.05, 0.13)),
+    ((1.5, 0.6, 0.138), (2.1, 1.13, 0.11), (1.1, 1.45, 0.15), (1.9, 2.05, 0.19)),
+    ((1.0, 1.0, 0.123), (1.75, 1.5, 0.151), (2.5, 2.0, 0.131), (2.4, 0.45, 0.184)),
+    ((1.673, 1.284, 0.153), (1.084, 0.536, 0.166), (1.38, 1.978, 0.101), (2.728, 1.178, 0.153)),
+    ((1.627, 1.989, 0.188), (0.889, 0.756, 0.127), (2.238, 0.454, 0.119), (2.07, 1.167, 0.136)),
+    ((1.154, 1.091, 0.151), (1.344, 0.286, 0.108), (2.193, 1.799, 0.199), (2.488, 0.925, 0.127)),
+    ((1.972, 1.233, 0.159), (1.245, 1.853, 0.112), (2.449, 0.494, 0.109), (2.637, 2.06, 0.166)),
+    ((2.187, 1.42, 0.184), (1.513, 0.516, 0.115), (1.107, 2.04, 0.153), (1.149, 1.148, 0.128)),
+    ((1.322, 1.896, 0.156), (2.403, 0.375, 0.155), (1.315, 1.056, 0.172), (2.602, 1.284, 0.116)),
+    ((1.852, 0.661, 0.144), (1.273, 1.054, 0.157), (2.571, 1.286, 0.186), (2.193, 2.028, 0.177)),
+)
+_HELD_OUT = (
+    ((1.3, 1.1, 0.18), (2.2, 1.4, 0.15), (1.0, 1.9, 0.12), (2.4, 0.6, 0.15)),
+    ((1.0, 0.7, 0.13), (1.8, 1.1, 0.16), (1.0, 1.8, 0.14), (2.5, 1.7, 0.15)),
+    ((1.0, 0.7, 0.13), (2.5, 0.8, 0.16), (1.6, 1.35, 0.14), (2.5, 1.7, 0.15)),
+)
+# fmt: on
+
+#: The paper's scenes by name: the nominal one, the 15 of ART-15s, the three held out for tests.
+SCENES: dict[str, Obstacles] = {
+    "nominal": Obstacles.from_rows(_NOMINAL),
+    **{f"training-{i}": Obstacles.from_rows(rows) for i, rows in enumerate(_TRAINING, 1)},
+    **{f"held-out-{i}": Obstacles.from_rows(rows) for i, rows in enumerate(_HELD_OUT, 1)},
+}
+
+#: Scenarios of the 15 training scenes of ART-15s, and of the three test scenes.
+TRAINING_SCENES = tuple(Scenario.named(f"training-{i}") for i in range(1, len(_TRAINING) + 1))
+HELD_OUT_SCENES = tuple(Scenario.named(f"held-out-{i}") for i in range(1, len(_HELD_OUT) + 1))
