@@ -1,0 +1,92 @@
+"""Solvers beneath the subproblem, behind one small protocol and chosen by name."""
+
+from __future__ import annotations
+
+import difflib
+import enum
+from dataclasses import dataclass
+from typing import Protocol
+
+from scipy import sparse
+
+from freeflyer_env.robot import FloatArray
+
+
+class SolverStatus(enum.Enum):
+    """What a solver said of one linear program."""
+
+    SOLVED = "solved"
+    INFEASIBLE = "infeasible"
+    FAILED = "failed"
+
+
+@dataclass(eq=False)
+class LinearProgram:
+    """``min c'x  s.t.  A x = b,  h_lower <= G x <= h_upper,  x_lower <= x <= x_upper``.
+
+    The patterns of ``a`` and ``g`` and the values of ``c`` and ``a`` never change once given to a
+    backend; everything else may be overwritten between solves.
+    """
+
+    c: FloatArray
+    a: sparse.csc_matrix
+    b: FloatArray
+    g: sparse.csc_matrix
+    h_lower: FloatArray
+    h_upper: FloatArray
+    x_lower: FloatArray
+    x_upper: FloatArray
+
+
+class Backend(Protocol):
+    """Solves one linear program again and again, with new values each time."""
+
+    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
+        """Status and, where solved, the primal solution."""
+
+
+class PIQPBackend:
+    """PIQP, a proximal interior-point method; one solver object, updated in place."""
+
+    def __init__(self) -> None:
+        import piqp
+
+        self._piqp = piqp
+        self._solver = piqp.SparseSolver()
+        self._solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
+        self._solver.settings.max_iter = 100
+        self._is_set_up = False
+
+    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
+        values = (program.g, program.h_lower, program.h_upper, program.x_lower, program.x_upper)
+        if self._is_set_up:
+            self._solver.update(None, None, None, program.b, *values)
+        else:
+            n = len(program.c)
+            zero = sparse.csc_matrix((n, n))
+            self._solver.setup(zero, program.c, program.a, program.b, *values)
+            self._is_set_up = True
+        status = self._solver.solve()
+        if status == self._piqp.PIQP_SOLVED:
+            return SolverStatus.SOLVED, self._solver.result.x
+        if status in (self._piqp.PIQP_PRIMAL_INFEASIBLE, self._piqp.PIQP_DUAL_INFEASIBLE):
+            return SolverStatus.INFEASIBLE, self._solver.result.x
+        return SolverStatus.FAILED, self._solver.result.x
+
+
+BACKENDS = {"piqp": PIQPBackend}
+
+
+def make_backend(name: str) -> Backend:
+    """A new solver object.
+
+    Raises:
+        ValueError: If no backend has that name; the message names the nearest one.
+    """
+    if name not in BACKENDS:
+        near = difflib.get_close_matches(name, BACKENDS, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise ValueError(
+            f"No solver backend is called {name!r}.{hint} Known: {', '.join(BACKENDS)}."
+        )
+    return BACKENDS[name]()
