@@ -53,7 +53,6 @@ class PIQPBackend:
 
         self._piqp = piqp
         self._solver = piqp.SparseSolver()
-        self._solver.settings.kkt_solver = piqp.KKTSolver.sparse_multistage
         self._solver.settings.max_iter = 100
         self._is_set_up = False
 

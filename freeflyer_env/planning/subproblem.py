@@ -58,6 +58,8 @@ class Subproblem:
         robot: Mass properties and thrusters.
         backend: Name of the solver (see :mod:`freeflyer_env.planning.backends`).
         elastic: Whether keep-out may be violated at a price.
+        velocity_rows: Whether the trust region on velocities is imposed from the start. It hardly ever
+            binds, so by default it is left out, checked afterwards, and imposed where it was violated.
     """
 
     def __init__(
@@ -69,9 +71,11 @@ class Subproblem:
         backend: str = "piqp",
         *,
         elastic: bool = False,
+        velocity_rows: bool = False,
     ) -> None:
         self.n_steps, self.n_obstacles, self.dt, self.robot = n_steps, n_obstacles, dt, robot
-        self.elastic = elastic
+        self.backend, self.elastic, self.velocity_rows = backend, elastic, velocity_rows
+        self._with_velocity_rows: Subproblem | None = None
         delta_v_max = robot.delta_v_max(dt)
         self._scale = delta_v_max * np.array([1.0, 1.0, robot.lever_arm])
         self._index_variables()
@@ -106,13 +110,32 @@ class Subproblem:
         self._set_actuation(reference)
         self._set_keep_out(problem, reference)
         self._set_bounds(problem, reference, trust_region)
-        self._set_velocity_rows(problem, reference, trust_region)
+        if self.velocity_rows:
+            self._set_velocity_rows(problem, reference, trust_region)
         status, x = self._backend.solve(self._program)
         if status is not SolverStatus.SOLVED:
             return SubproblemSolution(status, None)
         poses = np.empty((self.n_steps, 3))
         poses[1:-1] = x[self._pose_columns]
-        return SubproblemSolution(status, Trajectory.from_poses(problem, poses, with_controls=True))
+        trajectory = Trajectory.from_poses(problem, poses, with_controls=True)
+        moved = np.abs(trajectory.states[1:-1, 3:] - reference.states[1:-1, 3:]).max()
+        if not self.velocity_rows and moved > trust_region:
+            return self._strict().solve(problem, reference, trust_region)
+        return SubproblemSolution(status, trajectory)
+
+    def _strict(self) -> Subproblem:
+        """The same subproblem with its velocity rows, made when first needed."""
+        if self._with_velocity_rows is None:
+            self._with_velocity_rows = Subproblem(
+                self.n_steps,
+                self.n_obstacles,
+                self.dt,
+                self.robot,
+                self.backend,
+                elastic=self.elastic,
+                velocity_rows=True,
+            )
+        return self._with_velocity_rows
 
     # -- assembly, once --------------------------------------------------------------------------
 
@@ -153,7 +176,8 @@ class Subproblem:
         n, m, inner = self.n_steps, self.n_obstacles, self.n_steps - 2
         act = np.arange(4 * n).reshape(n, 4)
         keep = 4 * n + np.arange(m * inner).reshape(inner, m)
-        vel = 4 * n + m * inner + np.arange(3 * (n - 1)).reshape(n - 1, 3)
+        n_velocities = n - 1 if self.velocity_rows else 0
+        vel = 4 * n + m * inner + np.arange(3 * n_velocities).reshape(n_velocities, 3)
         self._act_rows, self._keep_rows, self._vel_rows = act, keep, vel
         split = self._split_columns.reshape(n, 6)
         blocks = {
@@ -164,8 +188,8 @@ class Subproblem:
                 keep[:, :, None],
                 np.broadcast_to(self._slack_columns[:, None], (inner, m, int(self.elastic))),
             ),
-            "vel_next": (vel[:-1], self._pose_columns),
-            "vel_previous": (vel[1:], self._pose_columns),
+            "vel_next": (vel[:-1], self._pose_columns[: len(vel)]),
+            "vel_previous": (vel[1:], self._pose_columns[: len(vel)]),
         }
         i = np.concatenate([rows.ravel() for rows, _ in blocks.values()])
         j = np.concatenate([columns.ravel() for _, columns in blocks.values()])
@@ -179,7 +203,7 @@ class Subproblem:
         data[self._slots["slack"]] = 1.0
         data[self._slots["vel_next"]] = 1.0 / self.dt
         data[self._slots["vel_previous"]] = -1.0 / self.dt
-        shape = (4 * n + m * inner + 3 * (n - 1), self._n_variables)
+        shape = (4 * n + m * inner + 3 * n_velocities, self._n_variables)
         return sparse.csc_matrix((data, i[order], pointers), shape=shape)
 
     # -- values, at every iteration --------------------------------------------------------------
