@@ -1,0 +1,41 @@
+"""Datasets of optimal free-flyer trajectories: recipes, generation, storage and loading.
+
+Minari, HDF5 and the solvers are imported when they are used first.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+# Not lazily: a submodule's name would hide the function of the same name.
+from freeflyer_datasets.generate import GenerationReport, generate
+from freeflyer_datasets.recipe import Recipe, list_recipes, load_recipe
+from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
+
+if TYPE_CHECKING:
+    from freeflyer_datasets.loading import PackedDataset
+    from freeflyer_datasets.storage import build
+
+__all__ = [
+    "LABEL_REL",
+    "LABEL_SCP",
+    "GenerationReport",
+    "PackedDataset",
+    "Recipe",
+    "build",
+    "generate",
+    "list_recipes",
+    "load_recipe",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "PackedDataset":
+        from freeflyer_datasets.loading import PackedDataset
+
+        return PackedDataset
+    if name == "build":
+        from freeflyer_datasets.storage import build
+
+        return build
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,310 @@
+"""Generation: solves a recipe's problems in parallel and writes them as shards.
+
+A shard's bytes depend on the recipe alone: not on the number of workers, their order, an interruption,
+or how many problems were asked for. A run that was interrupted is resumed by starting it again.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from freeflyer_datasets.recipe import Recipe
+from freeflyer_datasets.shards import (
+    LABEL_REL,
+    LABEL_SCP,
+    Shard,
+    ShardError,
+    read_shard,
+    shard_path,
+    write_shard,
+)
+from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, keep_out_depth
+from freeflyer_env.scenario import Problem
+
+if TYPE_CHECKING:
+    from freeflyer_env.planning import SCPResult
+
+logger = logging.getLogger(__name__)
+
+#: Problems in a shard; the last shard of a run may have fewer.
+SHARD_SIZE = 100
+
+
+@dataclass(frozen=True)
+class GenerationReport:
+    """What :func:`generate` did.
+
+    Attributes:
+        folder: Where the shards are.
+        n_problems: Problems that the shards hold now.
+        n_trajectories: Trajectories that the new shards hold.
+        new_shards: Shards that were made.
+        kept_shards: Good shards that were there.
+        remade_shards: Names of the damaged shards that were made again.
+        failed_problems: Indices of the problems of new shards that have no trajectory.
+        elapsed: Wall time in s.
+    """
+
+    folder: Path
+    n_problems: int
+    n_trajectories: int
+    new_shards: int
+    kept_shards: int
+    remade_shards: tuple[str, ...]
+    failed_problems: tuple[int, ...]
+    elapsed: float
+
+    def __str__(self) -> str:
+        lines = (
+            f"{self.n_problems} problems in {str(self.folder)!r}: {self.new_shards} shards made "
+            f"({self.n_trajectories} trajectories, {self.elapsed:.0f} s), {self.kept_shards} kept"
+        )
+        if self.remade_shards:
+            lines += f", {len(self.remade_shards)} damaged ones made again"
+        if self.failed_problems:
+            lines += f"; {len(self.failed_problems)} problems have no trajectory"
+        return lines + "."
+
+
+def generate(
+    recipe: Recipe,
+    out: str | Path,
+    n_problems: int | None = None,
+    workers: int | None = None,
+    progress: bool = True,
+) -> GenerationReport:
+    """Solves the first ``n_problems`` problems of a recipe and writes them as shards.
+
+    Good shards that are there already are kept. After an interruption, call it again.
+
+    Args:
+        recipe: What to make.
+        out: Folder of the shards; made if need be. One recipe per folder.
+        n_problems: How many problems; the recipe's own number if None.
+        workers: Processes, each with one thread; one per processor if None.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        What was made, kept and made again.
+
+    Raises:
+        ValueError: If ``out`` holds shards of another recipe.
+        RuntimeError: If every problem of a shard raised an exception; nothing is written then.
+    """
+    import joblib
+    from tqdm import tqdm
+
+    began = time.perf_counter()
+    n_problems = recipe.n_problems if n_problems is None else n_problems
+    if n_problems < 1:
+        raise ValueError(f"n_problems must be at least 1, got {n_problems}.")
+    folder = Path(out)
+    folder.mkdir(parents=True, exist_ok=True)
+    _write_recipe(folder, recipe)
+    missing, kept, damaged = _missing_shards(folder, recipe, n_problems)
+    bar = tqdm(total=n_problems, unit="problem", disable=not progress, smoothing=0.1)
+    bar.update(n_problems - sum(count for _, count in missing))
+    n_trajectories, failed = 0, []
+    with bar, joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+        parallel = joblib.Parallel(
+            n_jobs=workers or joblib.cpu_count(), return_as="generator_unordered"
+        )
+        jobs = (
+            joblib.delayed(_make_shard)(folder, recipe, number, count) for number, count in missing
+        )
+        for count, trajectories, failures in parallel(jobs):
+            bar.update(count)
+            n_trajectories += trajectories
+            failed += failures
+    return GenerationReport(
+        folder=folder,
+        n_problems=n_problems,
+        n_trajectories=n_trajectories,
+        new_shards=len(missing),
+        kept_shards=kept,
+        remade_shards=tuple(damaged),
+        failed_problems=tuple(sorted(failed)),
+        elapsed=time.perf_counter() - began,
+    )
+
+
+def solve_problems(recipe: Recipe, first: int, count: int) -> Shard:
+    """Solves problems ``first ... first + count - 1`` of a recipe.
+
+    An exception is recorded as the failure of its problem; a missing package is raised.
+    """
+    problems = [recipe.problem(index) for index in range(first, first + count)]
+    rows: list[dict[str, Any]] = []
+    c_rel, rel_cost = np.full(count, -1, np.int32), np.full(count, np.nan)
+    failures = [""] * count
+    for local, problem in enumerate(problems):
+        try:
+            records = _solve(recipe, problem)
+        except ImportError:
+            raise
+        except Exception as error:  # recorded with its index: one bad problem must not stop a run
+            failures[local] = f"{type(error).__name__}: {error}"[:200]
+            logger.warning("problem %d of %s: %s", first + local, recipe.id, failures[local])
+            continue
+        if not records:
+            failures[local] = "the relaxed problem was not solved"
+            continue
+        nodes = records[0]["trajectory"].states[:-1, :2]
+        depth = keep_out_depth(problem.scenario, nodes)
+        c_rel[local] = int((depth > FEASIBILITY_TOLERANCE).sum())
+        rel_cost[local] = records[0]["trajectory"].cost
+        rows += [{"problem": local, **record} for record in records]
+    return _pack(recipe, first, problems, c_rel, rel_cost, failures, rows)
+
+
+def _solve(recipe: Recipe, problem: Problem) -> list[dict[str, Any]]:
+    """The records of one problem: REL, then its optima, cheapest first."""
+    from freeflyer_env.planning import solve_multistart
+
+    found = solve_multistart(problem, n_starts=recipe.n_starts)
+    if found.rel.trajectory is None:
+        return []
+    records = [_record(problem, found.rel, LABEL_REL, rank=0, start_number=-1)]
+    optima = found.optima if recipe.optima == "all" else found.optima[:1]
+    numbers = {id(result): number for number, result in enumerate(found.results)}
+    for rank, optimum in enumerate(optima):
+        records.append(_record(problem, optimum, LABEL_SCP, rank, numbers[id(optimum)]))
+    return records
+
+
+def _record(
+    problem: Problem, result: SCPResult, label: int, rank: int, start_number: int
+) -> dict[str, Any]:
+    from freeflyer_env.planning import Trajectory
+
+    assert result.trajectory is not None
+    controls = np.float32(result.trajectory.controls)
+    trajectory = Trajectory.from_controls(problem, controls)
+    report = vars(trajectory.check(problem))
+    skipped = ("keep_out",) if label == LABEL_REL else ()
+    return {
+        "label": label,
+        "rank": rank,
+        "start_number": start_number,
+        "status": result.status.value,
+        "iterations": result.iterations,
+        "trajectory": trajectory,
+        "controls": controls,
+        "violation": max(value for name, value in report.items() if name not in skipped),
+    }
+
+
+def _pack(
+    recipe: Recipe,
+    first: int,
+    problems: list[Problem],
+    c_rel: np.ndarray,
+    rel_cost: np.ndarray,
+    failures: list[str],
+    rows: list[dict[str, Any]],
+) -> Shard:
+    obstacles = np.zeros((len(problems), recipe.max_obstacles, 3))
+    for local, problem in enumerate(problems):
+        table = problem.scenario.obstacles.rows()
+        obstacles[local, : len(table)] = table
+    lengths = [len(row["controls"]) for row in rows]
+
+    def column(name: str, dtype: Any) -> np.ndarray:
+        return np.array([row[name] for row in rows], dtype=dtype)
+
+    return Shard(
+        fingerprint=recipe.fingerprint,
+        first=first,
+        start=np.array([problem.start for problem in problems]),
+        goal=np.array([problem.goal for problem in problems]),
+        obstacles=obstacles,
+        final_time=np.array([problem.final_time for problem in problems]),
+        c_rel=c_rel,
+        rel_cost=rel_cost,
+        failure=np.array(failures, dtype="U200"),
+        problem=column("problem", np.int32),
+        label=column("label", np.uint8),
+        rank=column("rank", np.uint8),
+        status=column("status", "U24"),
+        iterations=column("iterations", np.int32),
+        start_number=column("start_number", np.int32),
+        cost=np.array([row["trajectory"].cost for row in rows], dtype=np.float64),
+        violation=column("violation", np.float64),
+        offsets=np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
+        controls=np.concatenate([row["controls"] for row in rows] or [np.empty((0, 3), "f4")]),
+    )
+
+
+def _make_shard(
+    folder: Path, recipe: Recipe, number: int, count: int
+) -> tuple[int, int, list[int]]:
+    """Makes one shard in a worker; returns its numbers of problems and trajectories, and failures."""
+    first = number * SHARD_SIZE
+    shard = solve_problems(recipe, first, count)
+    failed = [first + int(local) for local in np.flatnonzero(shard.failure != "")]
+    if len(failed) == count:
+        raise RuntimeError(
+            f"All {count} problems from {first} on failed, so the shard was not written. "
+            f"The first one: {shard.failure[0]}"
+        )
+    write_shard(shard_path(folder, number), shard)
+    return count, shard.n_trajectories, failed
+
+
+def _missing_shards(
+    folder: Path, recipe: Recipe, n_problems: int
+) -> tuple[list[tuple[int, int]], int, list[str]]:
+    """Number and size of the shards to make; how many are kept; names of the damaged ones."""
+    missing: list[tuple[int, int]] = []
+    damaged: list[str] = []
+    kept = 0
+    for number in range(-(-n_problems // SHARD_SIZE)):
+        path = shard_path(folder, number)
+        count = min(SHARD_SIZE, n_problems - number * SHARD_SIZE)
+        try:
+            shard = read_shard(path)
+        except FileNotFoundError:
+            missing.append((number, count))
+            continue
+        except ShardError as error:
+            logger.warning("%s It is made again.", error)
+            damaged.append(path.name)
+            missing.append((number, count))
+            continue
+        if shard.fingerprint != recipe.fingerprint:
+            raise _other_recipe(folder, path.name)
+        if shard.n_problems < count:  # the last shard of a shorter run
+            missing.append((number, count))
+        else:
+            kept += 1
+    return missing, kept, damaged
+
+
+def _write_recipe(folder: Path, recipe: Recipe) -> None:
+    """Leaves the recipe beside its shards, and refuses a folder of another one."""
+    path = folder / "recipe.json"
+    if path.is_file():
+        try:
+            other = Recipe.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError):
+            logger.warning("%s cannot be read and is written again.", path)
+        else:
+            if other.fingerprint != recipe.fingerprint:
+                raise _other_recipe(folder, path.name)
+    temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    temporary.write_text(json.dumps(recipe.to_dict(), indent=2) + "\n", encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _other_recipe(folder: Path, name: str) -> ValueError:
+    return ValueError(
+        f"{str(folder)!r} holds shards of another recipe ({name}); use another folder, or delete it."
+    )
