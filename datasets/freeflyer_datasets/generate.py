@@ -1,7 +1,7 @@
 """Generation: solves a recipe's problems in parallel and writes them as shards.
 
-A shard's bytes depend on the recipe alone: not on the number of workers, their order, an interruption,
-or how many problems were asked for. A run that was interrupted is resumed by starting it again.
+A shard's bytes depend on the recipe alone: not on the number of workers, their order, an
+interruption, or how many problems were asked for. Starting an interrupted run again resumes it.
 """
 
 from __future__ import annotations
@@ -186,8 +186,8 @@ def _record(
     from freeflyer_env.planning import Trajectory
 
     assert result.trajectory is not None
-    controls = np.float32(result.trajectory.controls)
-    trajectory = Trajectory.from_controls(problem, controls)
+    controls = result.trajectory.controls.astype(np.float32)
+    trajectory = Trajectory.from_controls(problem, controls.astype(np.float64))
     report = vars(trajectory.check(problem))
     skipped = ("keep_out",) if label == LABEL_REL else ()
     return {
@@ -246,7 +246,7 @@ def _pack(
 def _make_shard(
     folder: Path, recipe: Recipe, number: int, count: int
 ) -> tuple[int, int, list[int]]:
-    """Makes one shard in a worker; returns its numbers of problems and trajectories, and failures."""
+    """Makes one shard in a worker; returns how many problems and trajectories, and failures."""
     first = number * SHARD_SIZE
     shard = solve_problems(recipe, first, count)
     failed = [first + int(local) for local in np.flatnonzero(shard.failure != "")]
@@ -306,5 +306,5 @@ def _write_recipe(folder: Path, recipe: Recipe) -> None:
 
 def _other_recipe(folder: Path, name: str) -> ValueError:
     return ValueError(
-        f"{str(folder)!r} holds shards of another recipe ({name}); use another folder, or delete it."
+        f"{str(folder)!r} holds shards of another recipe ({name}); use another folder or delete it."
     )

@@ -73,7 +73,7 @@ class Recipe:
     def __post_init__(self) -> None:
         if not isinstance(self.id, str) or not _ID_PATTERN.fullmatch(self.id):
             raise ValueError(
-                f"id must look like 'namespace/name-v0' (letters, digits, - and _), got {self.id!r}."
+                f"id must look like 'namespace/name-v0' (letters, digits, -, _), got {self.id!r}."
             )
         if not isinstance(self.description, str) or not self.description.strip():
             raise ValueError(f"description must be a sentence, got {self.description!r}.")
@@ -160,8 +160,8 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
             version, or the path of a ``.toml`` file.
 
     Raises:
-        ValueError: If there is no such recipe, or the file has a mistake; the message names the file
-            and the key.
+        ValueError: If there is no such recipe, or the file has a mistake; the message names the
+            file and the key.
     """
     path = _recipe_path(name_or_path)
     try:
@@ -200,9 +200,10 @@ def _recipe_path(name_or_path: str | Path) -> Path:
     return _recipes_folder() / f"{name}.toml"
 
 
-def _require_int(name: str, value: object, low: int, high: int) -> None:
+def _require_int(name: str, value: object, low: int, high: int) -> int:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise ValueError(f"{name} must be a whole number in [{low}, {high}], got {value!r}.")
+    return value
 
 
 def _scenes(scenes: object) -> str | tuple[str, ...]:
@@ -230,11 +231,10 @@ def _obstacle_range(value: object, scenes: str | tuple[str, ...]) -> tuple[int, 
                 f"n_obstacles is for scenes = 'random' only, got {value!r}; remove it."
             )
         return None
+    value = 4 if value is None else value
     low, high = value if isinstance(value, tuple) and len(value) == 2 else (value, value)
-    if value is None:
-        low = high = 4
-    _require_int("n_obstacles", low, 0, _MAX_OBSTACLES)
-    _require_int("n_obstacles", high, 0, _MAX_OBSTACLES)
+    low = _require_int("n_obstacles", low, 0, _MAX_OBSTACLES)
+    high = _require_int("n_obstacles", high, 0, _MAX_OBSTACLES)
     if low > high:
         raise ValueError(f"n_obstacles must be [smallest, largest], got [{low}, {high}].")
     return low, high
@@ -245,18 +245,17 @@ def _final_times(values: object) -> tuple[float, ...]:
         raise ValueError(
             f"final_times must be a list of times in s or {{ range = [lo, hi] }}, got {values!r}."
         )
-    for time in times:
-        _require_time(time)
-    return tuple(float(time) for time in times)
+    return tuple(_require_time(time) for time in times)
 
 
-def _require_time(time: object) -> None:
+def _require_time(time: object) -> float:
     low, high = 2 * _DT, _MAX_STEPS * _DT
-    good = isinstance(time, int | float) and not isinstance(time, bool) and low <= time <= high
-    if not good or abs(time / _DT - round(time / _DT)) > 1e-9:  # type: ignore[operator,call-overload]
-        raise ValueError(
-            f"final_times must be multiples of dt = {_DT} s in [{low}, {high}] s, got {time!r}."
-        )
+    if isinstance(time, int | float) and not isinstance(time, bool) and low <= time <= high:
+        if abs(time / _DT - round(time / _DT)) <= 1e-9:
+            return float(time)
+    raise ValueError(
+        f"final_times must be multiples of dt = {_DT} s in [{low}, {high}] s, got {time!r}."
+    )
 
 
 def _expand_range(table: Mapping[str, Any]) -> tuple[float, ...]:
@@ -266,9 +265,7 @@ def _expand_range(table: Mapping[str, Any]) -> tuple[float, ...]:
         raise ValueError(
             f"final_times must be a list or {{ range = [lo, hi] }}, got {dict(table)}."
         )
-    for time in ends:
-        _require_time(time)
-    low, high = (round(time / _DT) for time in ends)
+    low, high = (round(_require_time(time) / _DT) for time in ends)
     if low > high:
         raise ValueError(f"final_times.range must be [smallest, largest], got {ends}.")
     return tuple(_DT * steps for steps in range(low, high + 1))

@@ -1,6 +1,6 @@
 """Shards: the files that generation writes, each a fixed run of problems with their trajectories.
 
-A shard is one ``.npz`` file that carries its own checksum. It is written under another name and then
+A shard is one ``.npz`` file that carries its own checksum. It is written under another name and
 renamed, so a shard that exists is complete, and one that was damaged later is recognised.
 """
 
@@ -131,7 +131,8 @@ def write_shard(path: Path, shard: Shard) -> None:
     arrays = _arrays(shard)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     with open(temporary, "wb") as file:
-        np.savez(file, digest=np.array(_digest(arrays)), **arrays)
+        arrays["digest"] = np.array(_digest(arrays))
+        np.savez(file, allow_pickle=False, **arrays)
         file.flush()
         os.fsync(file.fileno())
     os.replace(temporary, path)
