@@ -1,7 +1,7 @@
 """The constraints of the optimal control problem, checked on a trajectory.
 
-This is the one check that the planner, the datasets, the environment and the evaluation share. It works
-from the states and controls alone and shares no code with the solver.
+This is the one check that the planner, the datasets, the environment and the evaluation share. It
+works from the states and controls alone and shares no code with the solver.
 """
 
 from __future__ import annotations
@@ -77,7 +77,9 @@ def check(problem: Problem, states: FloatArray, controls: FloatArray) -> Constra
         goal=float(np.abs(states[-1] - problem.goal).max()),
         table=float(np.maximum(_off_table(scenario, states), 0.0).max()),
         keep_out=float(np.maximum(keep_out_depth(scenario, states[:, :2]), 0.0).max()),
-        actuation=float(np.maximum(actuation_excess(scenario, states[:-1, 2], controls), 0.0).max()),
+        actuation=float(
+            np.maximum(actuation_excess(scenario, states[:-1, 2], controls), 0.0).max()
+        ),
     )
 
 
@@ -89,8 +91,8 @@ def violations(
 ) -> FloatArray:
     """The indicator ``C(t_i)`` of the paper's eq. 6 for each of the ``N`` nodes, ``(N,)`` of 0 or 1.
 
-    A node violates if its state is off the table or inside a keep-out disc, or its control exceeds the
-    actuation limit, by more than ``tolerance``.
+    A node violates if its state is off the table or inside a keep-out disc, or its control exceeds
+    the actuation limit, by more than ``tolerance``.
     """
     nodes = np.asarray(states)[:-1]
     excess = np.maximum(_off_table(scenario, nodes), keep_out_depth(scenario, nodes[:, :2]))

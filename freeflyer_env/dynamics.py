@@ -1,12 +1,12 @@
 """The impulsive model of the optimal control problem, batched.
 
-State ``x = (r_x, r_y, psi, v_x, v_y, omega)`` and control ``u = (dv_x, dv_y, h)`` in SI units and the
-global frame. The impulse acts at the start of the step, then the robot drifts::
+State ``x = (r_x, r_y, psi, v_x, v_y, omega)`` and control ``u = (dv_x, dv_y, h)`` in SI units and
+the global frame. The impulse acts at the start of the step, then the robot drifts::
 
     v' = v + u_v,   omega' = omega + (m / J) h,   (r', psi') = (r, psi) + dt (v', omega')
 
-A trajectory of ``N`` controls has ``N + 1`` states; the last impulse is not followed by a drift, so its
-state is "after the last impulse", where the goal is prescribed.
+A trajectory of ``N`` controls has ``N + 1`` states; the last impulse is not followed by a drift, so
+its state is "after the last impulse", where the goal is prescribed.
 """
 
 from __future__ import annotations

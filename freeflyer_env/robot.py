@@ -12,8 +12,8 @@ The body frame has its origin at the centre of mass, ``e_x`` forward and ``e_y``
              <--       -->            (arrows show the exhaust; the push is opposite)
               (5)     (6)
 
-The eight thrusters form four opposed pairs, the *clusters* ``(7-0, 2-1, 4-3, 5-6)``: a cluster's signed
-delta-V is positive when its first thruster fires.
+The eight thrusters form four opposed pairs, the *clusters* ``(7-0, 2-1, 4-3, 5-6)``: a cluster's
+signed delta-V is positive when its first thruster fires.
 """
 
 from __future__ import annotations
@@ -130,9 +130,9 @@ class Robot:
     def allocate(self, wrench_body: FloatArray) -> FloatArray:
         """Thruster duties that realise a body wrench as nearly as the thrusters can.
 
-        The four clusters have one internal degree of freedom; it is used to minimise the largest duty,
-        so every realisable wrench is met exactly. A wrench beyond reach is scaled down, its direction
-        kept.
+        The four clusters have one internal degree of freedom; it is used to minimise the largest
+        duty, so every realisable wrench is met exactly. A wrench beyond reach is scaled down, its
+        direction kept.
 
         Args:
             wrench_body: ``(..., 3)`` force and torque ``(F_x, F_y, M)`` in N, N, N m, body frame.

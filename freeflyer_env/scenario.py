@@ -1,7 +1,7 @@
 """Scenes and problems: what the robot is asked to do, and where.
 
-A :class:`Scenario` is the table with its disc obstacles and the robot on it; a :class:`Problem` adds a
-start, a goal and a final time. The paper's scenes are in :data:`SCENES`, by name.
+A :class:`Scenario` is the table with its disc obstacles and the robot on it; a :class:`Problem`
+adds a start, a goal and a final time. The paper's scenes are in :data:`SCENES`, by name.
 """
 
 from __future__ import annotations
@@ -274,9 +274,9 @@ def sample_problem(
 ) -> Problem:
     """A random problem: start region left, goal region right, headings uniform, both at rest.
 
-    Start and goal are free of keep-out zones; nothing else is promised, so some problems are hard and
-    a few have no solution. Values are exactly representable in float32, so that a problem read back
-    from an observation is the same problem.
+    Start and goal are free of keep-out zones; nothing else is promised, so some problems are hard
+    and a few have no solution. Values are exactly representable in float32, so that a problem read
+    back from an observation is the same problem.
 
     Args:
         rng: Source of randomness.
@@ -307,7 +307,9 @@ def _sample_state_at_rest(
         gaps = np.linalg.norm(position - scenario.obstacles.centres, axis=1)
         if (gaps > scenario.keep_out_radii).all():
             return np.array([*position, np.float32(psi), 0.0, 0.0, 0.0], dtype=np.float64)
-    raise ValueError(f"The obstacles leave no free place with x in {x_range} m; use other obstacles.")
+    raise ValueError(
+        f"The obstacles leave no free place with x in {x_range} m; use other obstacles."
+    )
 
 
 # Rows (x, y, radius) in m.

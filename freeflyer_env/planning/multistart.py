@@ -1,7 +1,7 @@
 """Several starts, each passing the obstacles on other sides: the teacher, and the honest baseline.
 
-Whether the path passes left or right of each obstacle (its homotopy class, seen from start to goal) is
-what SCP cannot change once linearised, so the starts enumerate it instead of adding noise.
+Whether the path passes left or right of each obstacle (its homotopy class, seen from start to goal)
+is what SCP cannot change once linearised, so the starts enumerate it instead of adding noise.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ def solve_multistart(
 
     Args:
         problem: What to solve.
-        n_starts: Number of starts, at least 1; 1 is SCP from REL. Fewer are used where the obstacles
-            allow fewer classes.
+        n_starts: Number of starts, at least 1; 1 is SCP from REL. Fewer are used where the
+            obstacles allow fewer classes.
         config: Settings of every SCP loop.
 
     Returns:
@@ -81,9 +81,9 @@ def distinct_optima(results: tuple[SCPResult, ...]) -> tuple[SCPResult, ...]:
 def homotopy_starts(problem: Problem, n_starts: int) -> list[Trajectory]:
     """Warm starts through distinct homotopy classes, shortest path first.
 
-    Each combination of sides gives a path that bends around the obstacles near the straight line; it is
-    pushed out of the keep-out discs, and kept if it is the shortest of its class and stays on the table
-    and out of the discs.
+    Each combination of sides gives a path that bends around the obstacles near the straight line;
+    it is pushed out of the keep-out discs, and kept if it is the shortest of its class and stays on
+    the table and out of the discs.
 
     Returns:
         At most ``n_starts`` warm starts with zero controls.

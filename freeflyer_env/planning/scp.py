@@ -1,8 +1,8 @@
 """Sequential convex programming: the one loop that solves the optimal control problem.
 
-At each iteration the keep-out and actuation constraints are linearised about the last iterate and the
-subproblem is solved in a trust region that shrinks geometrically. REL, the relaxation without keep-out,
-goes through the same loop. Failures are values, not exceptions.
+At each iteration the keep-out and actuation constraints are linearised about the last iterate and
+the subproblem is solved in a trust region that shrinks geometrically. REL, the relaxation without
+keep-out, goes through the same loop. Failures are values, not exceptions.
 """
 
 from __future__ import annotations
@@ -144,7 +144,8 @@ def straight_line(problem: Problem) -> Trajectory:
 def solve_rel(problem: Problem, config: SCPConfig | None = None) -> SCPResult:
     """Solves REL, the relaxation without keep-out constraints, from the straight line.
 
-    Its cost is the paper's lower bound of the optimal cost and its trajectory the classical warm start.
+    Its cost is the paper's lower bound of the optimal cost and its trajectory the classical warm
+    start.
     """
     return _solve(problem, straight_line(problem), config or SCPConfig(), keep_out=False)
 
@@ -156,8 +157,8 @@ def solve_scp(
 
     Args:
         problem: What to solve.
-        warm_start: First reference, with ``problem.n_steps`` controls. None: REL is solved first and
-            used (its time counts, its iterations do not).
+        warm_start: First reference, with ``problem.n_steps`` controls. None: REL is solved first
+            and used (its time counts, its iterations do not).
         config: Settings of the loop.
 
     Returns:

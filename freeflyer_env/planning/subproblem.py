@@ -1,8 +1,9 @@
 """The convex subproblem of SCP, assembled once and re-valued at every iteration.
 
-The states are eliminated. With ``q_k = (r_x, r_y, psi)`` at the nodes ``k = 0 .. N - 1`` (``q_0`` and
-``q_{N-1}`` are the start's and the goal's) and the split controls ``u_k = s * (p_k - n_k)``,
-``p, n >= 0``, the linear program about a reference ``(x_ref, u_ref)`` with trust region ``rho`` is::
+The states are eliminated. With ``q_k = (r_x, r_y, psi)`` at the nodes ``k = 0 .. N - 1`` (``q_0``
+and ``q_{N-1}`` are the start's and the goal's) and the split controls ``u_k = s * (p_k - n_k)``,
+``p, n >= 0``, the linear program about a reference ``(x_ref, u_ref)`` with trust region ``rho``
+is::
 
     minimise    sum_k 1' diag(s) (p_k + n_k)                                    (= sum_k ||u_k||_1)
     subject to  (q_{k+1} - 2 q_k + q_{k-1}) / dt = g * s * (p_k - n_k)          dynamics
@@ -11,12 +12,12 @@ The states are eliminated. With ``q_k = (r_x, r_y, psi)`` at the nodes ``k = 0 .
                 table limits on r_k;  |q_k - q_ref,k| <= rho                       bounds
                 |(q_k - q_{k-1}) / dt - v_ref,k| <= rho                            velocity rows
 
-where ``g = (1, 1, m / J)``, ``M(psi) = Lambda^+ R_GB(psi)'`` gives the clusters' delta-Vs, ``c_m`` and
-``d_m`` are the obstacles' centres and keep-out radii, and the velocities before the first and after the
-last impulse, the start's and the goal's, take the place of the differences that leave the horizon.
-In the elastic form each interior node has a slack ``s_k >= 0`` that is added to its keep-out rows and
-priced in the objective, so that a bad reference cannot make the program infeasible.
-This is the OCP of the paper's eq. 4 with nine variables a node.
+where ``g = (1, 1, m / J)``, ``M(psi) = Lambda^+ R_GB(psi)'`` gives the clusters' delta-Vs, ``c_m``
+and ``d_m`` are the obstacles' centres and keep-out radii, and the velocities before the first and
+after the last impulse, the start's and the goal's, take the place of the differences that leave the
+horizon. In the elastic form each interior node has a slack ``s_k >= 0`` that is added to its
+keep-out rows and priced in the objective, so that a bad reference cannot make the program
+infeasible. This is the OCP of the paper's eq. 4 with nine variables a node.
 """
 
 from __future__ import annotations
@@ -28,10 +29,11 @@ from scipy import sparse
 
 from freeflyer_env.planning.backends import LinearProgram, SolverStatus, make_backend
 from freeflyer_env.planning.trajectory import Trajectory
-from freeflyer_env.robot import FloatArray, Robot
+from freeflyer_env.robot import Robot
 from freeflyer_env.scenario import Problem
 
-#: Price of a metre of slack in multiples of the largest delta-V; above the keep-out multipliers seen.
+#: Price of a metre of slack in multiples of the largest delta-V; above the keep-out multipliers
+#: seen.
 _SLACK_PRICE = 200.0
 
 
@@ -58,8 +60,9 @@ class Subproblem:
         robot: Mass properties and thrusters.
         backend: Name of the solver (see :mod:`freeflyer_env.planning.backends`).
         elastic: Whether keep-out may be violated at a price.
-        velocity_rows: Whether the trust region on velocities is imposed from the start. It hardly ever
-            binds, so by default it is left out, checked afterwards, and imposed where it was violated.
+        velocity_rows: Whether the trust region on velocities is imposed from the start. It hardly
+            ever binds, so by default it is left out, checked afterwards, and imposed where it was
+            violated.
     """
 
     def __init__(

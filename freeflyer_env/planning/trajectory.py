@@ -16,7 +16,8 @@ class Trajectory:
     """States and controls on the nodes of the optimal control problem.
 
     Attributes:
-        states: ``(N + 1, 6)`` states before each impulse, and after the last one (SI, global frame).
+        states: ``(N + 1, 6)`` states before each impulse, and after the last one (SI, global
+            frame).
         controls: ``(N, 3)`` impulses per unit mass ``(dv_x, dv_y, h)``.
         dt: Step in s.
     """
