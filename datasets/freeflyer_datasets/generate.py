@@ -281,7 +281,11 @@ def _missing_shards(
             continue
         if shard.fingerprint != recipe.fingerprint:
             raise _other_recipe(folder, path.name)
-        if shard.n_problems < count:  # the last shard of a shorter run
+        if shard.first != number * SHARD_SIZE or shard.n_problems > SHARD_SIZE:
+            logger.warning("%s has other problems than it should; it is made again.", path.name)
+            damaged.append(path.name)
+            missing.append((number, count))
+        elif shard.n_problems < count:  # the last shard of a shorter run
             missing.append((number, count))
         else:
             kept += 1

@@ -250,9 +250,9 @@ def _final_times(values: object) -> tuple[float, ...]:
 
 def _require_time(time: object) -> float:
     low, high = 2 * _DT, _MAX_STEPS * _DT
-    if isinstance(time, int | float) and not isinstance(time, bool) and low <= time <= high:
-        if abs(time / _DT - round(time / _DT)) <= 1e-9:
-            return float(time)
+    number = float(time) if type(time) in (int, float) else np.nan  # type: ignore[arg-type]
+    if low <= number <= high and abs(number / _DT - round(number / _DT)) <= 1e-9:
+        return number
     raise ValueError(
         f"final_times must be multiples of dt = {_DT} s in [{low}, {high}] s, got {time!r}."
     )

@@ -192,6 +192,18 @@ def iterate_shards(folder: Path, n_problems: int | None = None) -> Iterator[Shar
         raise ValueError(f"{str(folder)!r} holds {done} problems, {n_problems} are asked for.")
 
 
+def source_digest(folder: Path, n_problems: int | None = None) -> str:
+    """Hash of the checksums of the shards in a folder: tells whether they have changed."""
+    sha, done = hashlib.sha256(), 0
+    for path in list_shards(folder):
+        if n_problems is not None and done >= n_problems:
+            break
+        with np.load(path, allow_pickle=False) as file:
+            sha.update(str(file["digest"]).encode())
+            done += len(file["final_time"])
+    return sha.hexdigest()
+
+
 def _arrays(shard: Shard) -> dict[str, NDArray[Any]]:
     arrays = {item.name: np.asarray(getattr(shard, item.name)) for item in fields(shard)}
     return {"format": np.array(_FORMAT), **arrays}
