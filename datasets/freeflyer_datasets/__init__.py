@@ -14,7 +14,7 @@ from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 
 if TYPE_CHECKING:
     from freeflyer_datasets.loading import PackedDataset
-    from freeflyer_datasets.storage import build
+    from freeflyer_datasets.export import build
 
 __all__ = [
     "LABEL_REL",
@@ -35,7 +35,7 @@ def __getattr__(name: str) -> Any:
 
         return PackedDataset
     if name == "build":
-        from freeflyer_datasets.storage import build
+        from freeflyer_datasets.export import build
 
         return build
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

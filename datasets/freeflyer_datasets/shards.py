@@ -24,6 +24,7 @@ from freeflyer_env.scenario import Obstacles, Problem, Scenario
 LABEL_REL, LABEL_SCP = 0, 1
 
 _FORMAT = "freeflyer-shard-1"
+_DAMAGE = (OSError, KeyError, EOFError, TypeError, ValueError, zipfile.BadZipFile, zlib.error)
 
 
 class ShardError(ValueError):
@@ -150,20 +151,16 @@ def read_shard(path: Path) -> Shard:
             arrays = {name: file[name] for name in file.files}
         digest = str(arrays.pop("digest"))
         if str(arrays["format"]) != _FORMAT:
-            raise ShardError(f"{path.name} has format {arrays['format']}, not {_FORMAT}.")
+            raise ValueError(f"its format is {arrays['format']}, not {_FORMAT}")
         if _digest(arrays) != digest:
-            raise ShardError(f"{path.name} does not match its checksum.")
+            raise ValueError("it does not match its checksum")
+        del arrays["format"]
+        fingerprint, first = str(arrays.pop("fingerprint")), int(arrays.pop("first"))
+        return Shard(fingerprint, first, **arrays)
     except FileNotFoundError:
         raise
-    except (OSError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error) as error:
-        raise ShardError(f"{path.name} cannot be read: {error}") from error
-    except ShardError:
-        raise
-    except ValueError as error:
-        raise ShardError(f"{path.name} cannot be read: {error}") from error
-    del arrays["format"]
-    fingerprint, first = str(arrays.pop("fingerprint")), int(arrays.pop("first"))
-    return Shard(fingerprint, first, **arrays)
+    except _DAMAGE as error:
+        raise ShardError(f"{path.name} cannot be read: {error}.") from error
 
 
 def iterate_shards(folder: Path, n_problems: int | None = None) -> Iterator[Shard]:

@@ -1,0 +1,218 @@
+"""The dataset card: a page of Markdown that is written beside a dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from freeflyer_datasets.recipe import Recipe
+from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP, Shard
+
+#: Smallest ``C_REL`` of each class of difficulty (paper, Fig. 3).
+C_REL_CLASSES = (0, 5, 10, 15, 20)
+
+
+@dataclass(frozen=True, eq=False)
+class Statistics:
+    """What the card tells of a dataset.
+
+    Attributes:
+        n_problems: Problems, failed ones included.
+        n_failed: Problems without a trajectory.
+        n_steps: Steps of all trajectories.
+        c_rel: ``(P,)`` nodes of REL inside a keep-out zone, of the problems with trajectories.
+        rel_cost: ``(P,)`` cost of REL in m/s.
+        best_cost: ``(P,)`` cost of the cheapest optimum in m/s; NaN where none was found.
+        n_optima: ``(P,)`` number of optima kept.
+        rel_iterations: ``(P,)`` subproblems solved for REL.
+        scp_iterations: ``(number of optima,)`` subproblems solved for each optimum.
+        violation: Largest violation of a constraint of any trajectory.
+    """
+
+    n_problems: int
+    n_failed: int
+    n_steps: int
+    c_rel: NDArray[np.int32]
+    rel_cost: NDArray[np.float64]
+    best_cost: NDArray[np.float64]
+    n_optima: NDArray[np.int64]
+    rel_iterations: NDArray[np.int32]
+    scp_iterations: NDArray[np.int32]
+    violation: float
+
+    @property
+    def n_trajectories(self) -> int:
+        """Number of episodes."""
+        return len(self.rel_cost) + len(self.scp_iterations)
+
+    @property
+    def solved(self) -> NDArray[np.bool_]:
+        """``(P,)`` whether an optimum was found."""
+        return np.isfinite(self.best_cost)
+
+    @classmethod
+    def of_shards(cls, shards: Iterable[Shard]) -> Statistics:
+        """Statistics of the shards of one dataset."""
+        parts = [_shard_columns(shard) for shard in shards]
+        columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        return cls(
+            n_problems=int(columns.pop("n_problems").sum()),
+            n_failed=int(columns.pop("n_failed").sum()),
+            n_steps=int(columns.pop("n_steps").sum()),
+            violation=float(columns.pop("violation").max()),
+            **columns,
+        )
+
+
+def _shard_columns(shard: Shard) -> dict[str, np.ndarray]:
+    is_rel, is_best = shard.label == LABEL_REL, (shard.label == LABEL_SCP) & (shard.rank == 0)
+    kept = shard.problem[is_rel]
+    best = np.full(shard.n_problems, np.nan)
+    best[shard.problem[is_best]] = shard.cost[is_best]
+    optima = np.bincount(shard.problem[~is_rel], minlength=shard.n_problems)
+    return {
+        "n_problems": np.array([shard.n_problems]),
+        "n_failed": np.array([shard.n_problems - len(kept)]),
+        "n_steps": np.array([len(shard.controls)]),
+        "c_rel": shard.c_rel[kept],
+        "rel_cost": shard.rel_cost[kept],
+        "best_cost": best[kept],
+        "n_optima": optima[kept],
+        "rel_iterations": shard.iterations[is_rel],
+        "scp_iterations": shard.iterations[~is_rel],
+        "violation": np.array([shard.violation.max(initial=0.0)]),
+    }
+
+
+def dataset_card(recipe: Recipe, statistics: Statistics, version: str) -> str:
+    """The card as Markdown.
+
+    Args:
+        recipe: How the dataset was made.
+        statistics: What is in it.
+        version: Version of ``freeflyer-gym`` that made it.
+    """
+    s, name = statistics, recipe.id.rsplit("/", 1)[-1]
+    return f"""---
+license: mit
+tags: [minari, offline-rl, trajectory-optimization, spacecraft]
+---
+
+# {recipe.id}
+
+{recipe.description}
+Trajectories of a planar spacecraft robot with eight thrusters: for each problem the relaxed
+solution, which ignores the obstacles (REL), and the local optima that sequential convex programming
+(SCP) finds.
+
+```python
+import minari
+
+dataset = minari.load_dataset("{recipe.id}")
+env = dataset.recover_environment()
+```
+
+## Contents
+
+{_contents(recipe, s)}
+
+## Difficulty
+
+`C_REL` counts the nodes of the relaxed trajectory that lie inside a keep-out zone.
+
+{_difficulty(s)}
+
+## Episodes
+
+Observations are dictionaries of `state` (6), `goal` (6), `obstacles` ({recipe.max_obstacles}, 3) and
+`time_to_go` (1), all float32 in SI units and the table frame; actions are impulses per unit mass
+`(dv_x, dv_y, h)`; the reward is minus the 1-norm of the action. The last observation is the state
+after the last impulse. The states are those that the stored actions produce, to 1e-6.
+Split by the attribute `problem_index`, never by episode.
+
+## How it was made
+
+With freeflyer-gym {version}, seed {recipe.seed}, recipe `{name}`:
+`freeflyer_datasets.build("{name}")` makes it again. SCP was started from
+{_starts(recipe)}; kept is {_kept(recipe)}. Every trajectory was checked against the constraints by
+code that the solver does not share; the largest violation, with float32 actions, is
+{s.violation:.1e}.
+
+## Licence and citation
+
+MIT. Please cite freeflyer-gym, and the paper whose method and protocol this follows: D. Celestini,
+A. Afsharrad, D. Gammelli, T. Guffanti, G. Zardini, S. Lall, E. Capello, S. D'Amico, M. Pavone,
+"Generalizable Spacecraft Trajectory Generation via Multimodal Learning with Transformers".
+"""
+
+
+def _contents(recipe: Recipe, s: Statistics) -> str:
+    times = recipe.final_times
+    if len(times) > 6:
+        final_times = f"{min(times):g} to {max(times):g} ({len(times)} values)"
+    else:
+        final_times = ", ".join(f"{time:g}" for time in times)
+    solved = s.solved
+    rows = [
+        ("problems", f"{s.n_problems:,}"),
+        ("without any trajectory", f"{s.n_failed:,}"),
+        ("episodes", f"{s.n_trajectories:,} (REL {len(s.rel_cost):,}, SCP {s.n_optima.sum():,})"),
+        ("steps", f"{s.n_steps:,}"),
+        ("scenes", "random" if recipe.scenes == "random" else ", ".join(recipe.scenes)),
+        ("final times in s", final_times),
+        ("problems with an optimum", f"{_percent(solved)}"),
+        ("optima per problem", f"{_mean(s.n_optima)}"),
+        ("cost of REL in m/s", _quantiles(s.rel_cost)),
+        ("cost of the cheapest optimum in m/s", _quantiles(s.best_cost[solved])),
+        ("its cost over that of REL", _quantiles(s.best_cost[solved] / s.rel_cost[solved])),
+        ("subproblems per REL solution", _mean(s.rel_iterations)),
+        ("subproblems per SCP optimum", _mean(s.scp_iterations)),
+        ("C_REL", _quantiles(s.c_rel)),
+    ]
+    return _table(("", "value"), rows)
+
+
+def _difficulty(s: Statistics) -> str:
+    rows = []
+    for least in C_REL_CLASSES:
+        mask = s.c_rel >= least
+        solved = mask & s.solved
+        ratio = s.best_cost[solved] / s.rel_cost[solved]
+        rows.append((f">= {least}", _percent(mask), _percent(s.solved[mask]), _mean(ratio)))
+    return _table(("C_REL", "problems", "with an optimum", "best cost / REL cost"), rows)
+
+
+def _starts(recipe: Recipe) -> str:
+    if recipe.n_starts == 1:
+        return "the relaxed solution"
+    return (
+        f"the relaxed solution and up to {recipe.n_starts - 1} paths that pass the obstacles on "
+        "other sides"
+    )
+
+
+def _kept(recipe: Recipe) -> str:
+    return "the cheapest optimum" if recipe.optima == "best" else "every distinct optimum"
+
+
+def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:
+    lines = [head, ("---",) * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def _percent(mask: np.ndarray) -> str:
+    return f"{100 * mask.mean():.1f} %" if len(mask) else "-"
+
+
+def _mean(values: np.ndarray) -> str:
+    return f"{values.mean():.3g}" if len(values) else "-"
+
+
+def _quantiles(values: np.ndarray) -> str:
+    if not len(values):
+        return "-"
+    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+    return f"median {middle:.3g} (5 % {low:.3g}, 95 % {high:.3g})"
