@@ -1,0 +1,261 @@
+"""The multi-hypothesis head: several whole trajectories and their scores in one forward pass.
+
+A problem becomes a short sequence: one token for start, goal and final time, one for each obstacle, and
+one learned query for each hypothesis. A bidirectional transformer mixes them; each query is then decoded
+into a score and a path, given as the deviation from uniform motion along the straight line::
+
+    q(s) = (1 - s) q_start + s q_goal + sum_k phi_k(s) d_k,      s = t / t_last,   q = (r_x, r_y, psi)
+
+with hat functions ``phi_k`` at equally spaced knots, so that the ends are exact and any number of nodes
+can be read off. There is no order among obstacles, and no limit to their number.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from art_policy.layers import ARTConfig, Block, Decoder, Encoder, initialise
+from art_policy.sequence import ProblemBatch, random_flags
+
+_N_PROBLEM_FEATURES = 14
+_N_DISC_FEATURES = 12
+_POSE_SCALE = (0.25, 0.25, 0.5)  # m, m, rad: size of a typical deviation
+_ROBOT_RADIUS = 0.15  # m: half the width of the gap that lets the robot pass
+
+
+@lru_cache(maxsize=64)
+def interpolation_matrix(n_knots: int, n_nodes: int) -> Tensor:
+    """``(n_nodes, n_knots)`` values of the hat functions at equally spaced nodes; zero at the ends."""
+    position = torch.linspace(0.0, n_knots + 1.0, n_nodes)
+    distance = (position[:, None] - torch.arange(1.0, n_knots + 1.0)).abs()
+    return (1.0 - distance).clamp(min=0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisBatch:
+    """Training examples: problems and their known optima, cheapest first.
+
+    Attributes:
+        problems: ``B`` problems.
+        paths: ``(B, R, S, 3)`` deviations ``(r_x, r_y, psi)`` of the optima from the straight line, at
+            ``S`` equally spaced times; m and rad.
+        costs: ``(B, R)`` costs in m/s, infinite where a problem has fewer than ``R`` optima.
+    """
+
+    problems: ProblemBatch
+    paths: Tensor
+    costs: Tensor
+
+    def to(self, device: torch.device | str) -> HypothesisBatch:
+        """The same on another device."""
+        return HypothesisBatch(
+            self.problems.to(device), self.paths.to(device), self.costs.to(device)
+        )
+
+    def augmented(self, table: tuple[float, float], generator: torch.Generator) -> HypothesisBatch:
+        """Each example under a random one of the four symmetries of mirror and time reversal."""
+        batch = len(self.problems)
+        mirror, reverse = random_flags(batch, generator), random_flags(batch, generator)
+        problems = self.problems.mirrored(mirror, table[1]).reversed(reverse, table[0])
+        flip = self.paths.new_tensor([1.0, -1.0, -1.0])
+        paths = torch.where(mirror[:, None, None, None], self.paths * flip, self.paths)
+        flip = self.paths.new_tensor([-1.0, 1.0, -1.0])
+        paths = torch.where(reverse[:, None, None, None], paths.flip(2) * flip, paths)
+        return HypothesisBatch(problems, paths, self.costs)
+
+
+@dataclass(frozen=True)
+class HypothesisLoss:
+    """Weights of the training loss.
+
+    Attributes:
+        heading_weight: Weight of a squared heading error in rad against one of position in m.
+        others_weight: Weight of the optima other than the cheapest.
+        idle_weight: Weight of the pull on hypotheses that no optimum claimed, towards the cheapest.
+        score_weight: Weight of the scores' cross-entropy.
+        cost_temperature: Relative excess cost at which an optimum's share of the score target has
+            fallen by a factor of e.
+        length_scale: Distance in m below which the error counts squared rather than linearly.
+    """
+
+    heading_weight: float = 0.1
+    others_weight: float = 0.3
+    idle_weight: float = 0.02
+    score_weight: float = 0.2
+    cost_temperature: float = 0.02
+    length_scale: float = 0.05
+
+
+class MultiHypothesis(nn.Module):
+    """Problem in, ``n_hypotheses`` trajectories and scores out."""
+
+    def __init__(self, config: ARTConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.problem_encoder = Encoder(_N_PROBLEM_FEATURES, config.width)
+        self.disc_encoder = Encoder(_N_DISC_FEATURES, config.width)
+        self.query_embedding = nn.Parameter(torch.randn(config.n_hypotheses, config.width))
+        self.dropout = nn.Dropout(config.dropout)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.n_layers))
+        self.knot_decoder = Decoder(config.width, 3 * config.n_knots)
+        self.score_decoder = Decoder(config.width, 1)
+        initialise(self, config.n_layers)
+
+    def forward(self, problems: ProblemBatch) -> tuple[Tensor, Tensor]:
+        """Proposals for each problem.
+
+        Returns:
+            Deviations at the knots ``(B, H, n_knots, 3)`` in m, m, rad, and score logits ``(B, H)``.
+        """
+        batch, n_queries = len(problems), self.config.n_hypotheses
+        tokens = torch.cat(
+            [
+                self.query_embedding.expand(batch, -1, -1),
+                self.problem_encoder(problem_features(problems, self.config.table))[:, None],
+                self.disc_encoder(disc_features(problems, self.config.table)),
+            ],
+            dim=1,
+        )  # (B, H + 1 + M, width)
+        x, mask = self.dropout(tokens), _padding_mask(problems, n_queries + 1)
+        for block in self.blocks[:-1]:
+            x = block(x, mask=mask)
+        x = self.blocks[-1](x, mask=mask, n_queries=n_queries)  # (B, H, width)
+        knots = self.knot_decoder(x).view(batch, n_queries, self.config.n_knots, 3)
+        return knots * knots.new_tensor(_POSE_SCALE), self.score_decoder(x).squeeze(-1)
+
+    def loss(
+        self, batch: HypothesisBatch, weights: HypothesisLoss = HypothesisLoss()
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """Winner-takes-all regression and cross-entropy of the scores.
+
+        Returns:
+            The loss, and figures to log: ``distance`` to the cheapest optimum of the nearest and
+            ``chosen_distance`` of the best-scored hypothesis in m, ``agreement`` of the two, and the
+            ``regret``, the relative excess cost of the optimum nearest to the best-scored one.
+        """
+        knots, scores = self(batch.problems)
+        matrix = interpolation_matrix(self.config.n_knots, batch.paths.shape[2]).to(knots.device)
+        with torch.autocast(knots.device.type, enabled=False):
+            paths = torch.einsum("sk,bhkc->bhsc", matrix, knots)  # (B, H, S, 3)
+            distances = _distances(paths, batch.paths, weights.heading_weight)  # (B, R, H)
+        owner, known = _assign(distances.detach(), batch.costs)  # (B, R)
+        delta = weights.length_scale
+        errors = (delta**2 + distances.square()).sqrt() - delta
+
+        share = torch.full_like(batch.costs, weights.others_weight)
+        share[:, 0] = 1.0
+        matched = errors.gather(2, owner[..., None]).squeeze(2)  # (B, R)
+        regression = (matched * share * known).sum(1).mean()
+        claimed = F.one_hot(owner, scores.shape[1]).bool() & known[..., None]  # (B, R, H)
+        idle = (errors[:, 0] * ~claimed.any(1)).mean()
+
+        excess = (batch.costs / batch.costs[:, :1] - 1.0).nan_to_num(posinf=math.inf)
+        merit = torch.softmax(-excess / weights.cost_temperature, dim=1)  # (B, R)
+        target = torch.zeros_like(scores).scatter_add(1, owner, merit * known)
+        choice = -(target * F.log_softmax(scores, dim=1)).sum(1).mean()
+
+        loss = (regression + weights.idle_weight * idle) / delta + weights.score_weight * choice
+        chosen = scores.argmax(1)
+        reached = distances.gather(2, chosen[:, None, None].expand(-1, distances.shape[1], 1))
+        nearest = reached.squeeze(2).masked_fill(~known, math.inf).argmin(1)
+        figures = {
+            "distance": distances[:, 0].amin(1).mean(),
+            "chosen_distance": reached[:, 0].mean(),
+            "score_loss": choice,
+            "agreement": (chosen == owner[:, 0]).float().mean(),
+            "regret": excess.gather(1, nearest[:, None]).mean(),
+        }
+        return loss, {name: value.detach() for name, value in figures.items()}
+
+
+def _distances(paths: Tensor, optima: Tensor, heading_weight: float) -> Tensor:
+    """Root mean squared distance ``(B, R, H)`` between proposals and optima, heading weighted."""
+    weight = (paths.new_tensor([1.0, 1.0, heading_weight]) / paths.shape[2]).sqrt()
+    a, b = (optima * weight).flatten(2), (paths * weight).flatten(2)  # (B, R | H, 3 S)
+    squares = a.square().sum(2)[:, :, None] + b.square().sum(2)[:, None]
+    return (squares - 2.0 * a @ b.transpose(1, 2)).clamp(min=1e-10).sqrt()
+
+
+def _assign(distances: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
+    """Each optimum's own hypothesis, cheapest optimum first, none given away twice.
+
+    Returns:
+        Index of the hypothesis ``(B, R)``, and whether that optimum exists and got one ``(B, R)``.
+    """
+    n_hypotheses = distances.shape[2]
+    taken = torch.zeros_like(distances[:, 0], dtype=torch.bool)
+    owners = []
+    for rank in range(distances.shape[1]):
+        free = distances[:, rank].masked_fill(taken, math.inf)
+        owner = free.argmin(1)
+        exists = costs[:, rank].isfinite()
+        taken = taken | (F.one_hot(owner, n_hypotheses).bool() & exists[:, None])
+        owners.append(owner)
+    order = torch.arange(distances.shape[1], device=costs.device)
+    return torch.stack(owners, dim=1), costs.isfinite() & (order < n_hypotheses)
+
+
+def _padding_mask(problems: ProblemBatch, n_others: int) -> Tensor | None:
+    """``(B, 1, 1, L)`` True at real tokens, or None where nothing is padded."""
+    present = problems.present
+    if bool(present.all()):
+        return None
+    return F.pad(present, (n_others, 0), value=True)[:, None, None, :]
+
+
+def problem_features(problems: ProblemBatch, table: tuple[float, float]) -> Tensor:
+    """``(B, 14)`` scaled description of start, goal and final time (both ends at rest)."""
+    size = problems.start.new_tensor(table)
+    start, goal = problems.start[:, :3], problems.goal[:, :3]
+    way = goal[:, :2] - start[:, :2]
+    span = way.norm(dim=1, keepdim=True).clamp(min=1e-6)
+    headings = 4.0 * torch.stack([start[:, 2], goal[:, 2]], dim=1)  # quarter turns drop out
+    return torch.cat(
+        [
+            2.0 * start[:, :2] / size - 1.0,
+            2.0 * goal[:, :2] / size - 1.0,
+            headings.cos(),
+            headings.sin(),
+            (goal[:, 2:] - start[:, 2:]) / math.pi,
+            (problems.final_time[:, None] / 40.0).log(),
+            40.0 / problems.final_time[:, None],
+            span / size[0],
+            way / span,
+        ],
+        dim=1,
+    )
+
+
+def disc_features(problems: ProblemBatch, table: tuple[float, float]) -> Tensor:
+    """``(B, M, 12)`` scaled description of each disc, on the table and relative to start and goal."""
+    size = problems.start.new_tensor(table)
+    centre, radius = problems.discs[..., :2], problems.discs[..., 2:]
+    start, goal = problems.start[:, None, :2], problems.goal[:, None, :2]
+    span = (goal - start).norm(dim=2, keepdim=True).clamp(min=1e-6)
+    along = (goal - start) / span
+    offset = centre - start
+    progress = (offset * along).sum(2, keepdim=True)
+    side = along[..., :1] * offset[..., 1:] - along[..., 1:] * offset[..., :1]  # left positive
+    low, high = _ROBOT_RADIUS, size[1] - _ROBOT_RADIUS
+    return torch.cat(
+        [
+            2.0 * centre / size - 1.0,
+            10.0 * (radius - 0.33),
+            2.0 * progress / span - 1.0,
+            2.0 * side,
+            4.0 * (side - radius),
+            4.0 * (side + radius),
+            offset.norm(dim=2, keepdim=True) - radius,
+            (centre - goal).norm(dim=2, keepdim=True) - radius,
+            2.0 * (centre[..., 1:] - radius - low),
+            2.0 * (high - centre[..., 1:] - radius),
+            (radius - side.abs()).clamp(min=0.0) * 4.0,
+        ],
+        dim=2,
+    )

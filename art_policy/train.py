@@ -1,0 +1,361 @@
+"""Training of both heads: one loop, seeded, and resumable from its last checkpoint.
+
+Everything random in step ``i`` is a function of ``(seed, i)`` alone: the order of the examples, their
+augmentation, dropout. A run that was cut off and resumed therefore gives the same weights as one that was
+not, as long as its schedule counts steps (``max_steps``); with ``max_minutes`` the learning rate follows
+the clock.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+from tqdm.auto import tqdm
+
+from art_policy.layers import ARTConfig
+from art_policy.model import ART
+from art_policy.training_data import HypothesisSet
+
+if TYPE_CHECKING:
+    from freeflyer_datasets.loading import PackedDataset
+
+logger = logging.getLogger(__name__)
+
+CHECKPOINT_NAME, LOG_NAME = "checkpoint.pt", "log.jsonl"
+PRECISIONS = ("auto", "float32", "bfloat16")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How to train.
+
+    Attributes:
+        max_steps: Number of optimiser steps, or None if only the clock counts.
+        max_minutes: Minutes of training, over all resumed runs, or None. Whichever comes first ends the
+            run, and the learning rate reaches its end there.
+        batch_size: Examples in a step (at most as many as there are).
+        learning_rate: Peak rate of AdamW; linear warm-up, then cosine decay to a hundredth.
+        weight_decay: Of matrices; vectors are not decayed.
+        warmup_share: Share of the run that warms up.
+        gradient_clip: Largest norm of the gradient.
+        ema_decay: Decay of the running average of the weights, which is what is saved.
+        augment: Whether examples are put under random symmetries of the problem.
+        validation_fraction: Share of the problems that are held out.
+        log_every: Steps between lines of the log.
+        validate_every: Steps between validations.
+        checkpoint_minutes: Minutes between checkpoints.
+        precision: ``"bfloat16"`` for autocast, ``"float32"``, or ``"auto"``: bfloat16 where the processor
+            has instructions for it.
+        threads: Threads of PyTorch, or None to leave that alone.
+        seed: Of everything random.
+        device: Where to train.
+        compile: Whether to use ``torch.compile``.
+    """
+
+    max_steps: int | None = None
+    max_minutes: float | None = None
+    batch_size: int = 512
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.05
+    warmup_share: float = 0.03
+    gradient_clip: float = 1.0
+    ema_decay: float = 0.999
+    augment: bool = True
+    validation_fraction: float = 0.05
+    log_every: int = 50
+    validate_every: int = 500
+    checkpoint_minutes: float = 3.0
+    precision: str = "auto"
+    threads: int | None = None
+    seed: int = 0
+    device: str = "cpu"
+    compile: bool = False
+
+    def __post_init__(self) -> None:
+        if self.max_steps is None and self.max_minutes is None:
+            raise ValueError("TrainConfig needs max_steps or max_minutes (or both).")
+        for name in ("max_steps", "max_minutes", "batch_size", "learning_rate", "gradient_clip",
+                     "log_every", "validate_every", "checkpoint_minutes"):  # fmt: skip
+            value = getattr(self, name)
+            if value is not None and not value > 0:
+                raise ValueError(f"TrainConfig.{name} must be positive, got {value}.")
+        for name in ("warmup_share", "ema_decay"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(
+                    f"TrainConfig.{name} must be in [0, 1), got {getattr(self, name)}."
+                )
+        if self.precision not in PRECISIONS:
+            raise ValueError(
+                f"TrainConfig.precision must be one of {PRECISIONS}, got {self.precision!r}."
+            )
+
+    def progress(self, step: int, seconds: float) -> float:
+        """Share of the run that is done, 0 to 1, by steps or by the clock."""
+        by_steps = step / self.max_steps if self.max_steps else 0.0
+        by_clock = seconds / (60.0 * self.max_minutes) if self.max_minutes else 0.0
+        return min(max(by_steps, by_clock), 1.0)
+
+    def rate(self, progress: float) -> float:
+        """Learning rate at a share of the run."""
+        if progress < self.warmup_share:
+            return self.learning_rate * max(progress / self.warmup_share, 0.01)
+        share = (progress - self.warmup_share) / (1.0 - self.warmup_share)
+        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * share)))
+
+
+@dataclass
+class _State:
+    """What a checkpoint holds."""
+
+    model: ART
+    average: list[Tensor]
+    optimizer: torch.optim.Optimizer
+    step: int = 0
+    seconds: float = 0.0
+    settings: dict[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def create(cls, model_config: ARTConfig, config: TrainConfig) -> _State:
+        torch.manual_seed(config.seed)
+        model = ART(model_config).to(config.device)
+        matrices = [p for p in model.parameters() if p.dim() >= 2]
+        vectors = [p for p in model.parameters() if p.dim() < 2]
+        groups = [
+            {"params": matrices, "weight_decay": config.weight_decay},
+            {"params": vectors, "weight_decay": 0.0},
+        ]
+        rate = config.learning_rate
+        optimizer = torch.optim.AdamW(groups, lr=rate, betas=(0.9, 0.98), fused=True)
+        average = [p.detach().clone() for p in model.parameters()]
+        settings = {"model": model_config.to_dict(), "train": dataclasses.asdict(config)}
+        return cls(model, average, optimizer, settings=settings)
+
+    def save(self, path: Path) -> None:
+        """Writes the checkpoint; a crash leaves the old one or the new one, never half of one."""
+        content = {
+            "model": self.model.state_dict(),
+            "average": self.average,
+            "optimizer": self.optimizer.state_dict(),
+            "step": self.step,
+            "seconds": self.seconds,
+            "settings": self.settings,
+        }
+        temporary = path.with_suffix(".tmp")
+        torch.save(content, temporary)
+        os.replace(temporary, path)
+
+    def load(self, path: Path) -> None:
+        content = torch.load(path, weights_only=True)
+        for kind in ("model", "train"):
+            ours, theirs = self.settings[kind], content["settings"][kind]
+            changed = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
+            if changed := [name for name in changed if name not in _MAY_CHANGE]:
+                raise ValueError(
+                    f"{path} is of a run with another {', '.join(changed)}; "
+                    "train into another folder, or pass resume=False to start anew."
+                )
+        self.model.load_state_dict(content["model"])
+        self.optimizer.load_state_dict(content["optimizer"])
+        for mine, stored in zip(self.average, content["average"]):
+            mine.copy_(stored)
+        self.step, self.seconds = content["step"], content["seconds"]
+
+    def update_average(self, decay: float) -> None:
+        weight = 1.0 - min(decay, (1.0 + self.step) / (10.0 + self.step))
+        torch._foreach_lerp_(self.average, [p.detach() for p in self.model.parameters()], weight)
+
+    def averaged_model(self) -> ART:
+        """A copy of the model with the averaged weights, for validation and release."""
+        model = ART(self.model.config).to(self.model.device)
+        with torch.no_grad():
+            for parameter, value in zip(model.parameters(), self.average):
+                parameter.copy_(value)
+        return model.eval()
+
+
+#: Settings in which a resumed run may differ from the one that wrote the checkpoint.
+_MAY_CHANGE = frozenset(
+    {"threads", "log_every", "validate_every", "checkpoint_minutes", "compile", "device",
+     "max_minutes", "max_steps"}
+)  # fmt: skip
+
+
+def train(
+    dataset: PackedDataset,
+    model_config: ARTConfig,
+    config: TrainConfig,
+    out: str | Path,
+    resume: bool = True,
+) -> ART:
+    """Trains a model and writes it, its log and its checkpoint into ``out``.
+
+    Args:
+        dataset: Packed dataset; a share of its problems is held out for validation.
+        model_config: Size and kind of the model.
+        config: How to train.
+        out: Folder for ``model.safetensors``, ``config.json``, ``log.jsonl``, ``checkpoint.pt``.
+        resume: Whether to go on from a checkpoint in ``out``.
+
+    Returns:
+        The model with averaged weights, in evaluation mode. After Ctrl-C too: everything is saved.
+
+    Raises:
+        ValueError: If a checkpoint in ``out`` is of a different run, or there is nothing to train on.
+    """
+    out = Path(out)
+    out.mkdir(parents=True, exist_ok=True)
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    training, validation = (
+        HypothesisSet(dataset, part, model_config.table)
+        for part in dataset.split(config.validation_fraction)
+    )
+    if not len(training):
+        raise ValueError("The dataset has no solved trajectory to train on.")
+    state = _State.create(model_config, config)
+    checkpoint = out / CHECKPOINT_NAME
+    if resume and checkpoint.exists():
+        state.load(checkpoint)
+        logger.info("Resuming at step %d of %s.", state.step, checkpoint)
+    log = _Log(out / LOG_NAME, state.step)
+    logger.info("%d problems, %d parameters.", len(training), state.model.num_parameters)
+    try:
+        _loop(state, training, validation, config, log, checkpoint)
+    except KeyboardInterrupt:
+        logger.warning("Interrupted at step %d; saving.", state.step)
+    state.save(checkpoint)
+    model = state.averaged_model()
+    if len(validation):
+        log.write(step=state.step, **_validate(model, validation, config))
+    model.save_pretrained(out)
+    return model
+
+
+def _loop(
+    state: _State,
+    training: HypothesisSet,
+    validation: HypothesisSet,
+    config: TrainConfig,
+    log: _Log,
+    checkpoint: Path,
+) -> None:
+    """Optimiser steps until the schedule ends."""
+    batches = _batches(training, state.step, config)
+    parameters = list(state.model.parameters())
+    compute_loss = torch.compile(state.model.net.loss) if config.compile else state.model.net.loss
+    start, first, saved = time.perf_counter() - state.seconds, state.step, time.perf_counter()
+    mark = time.perf_counter()
+    bar = tqdm(total=1000, unit="‰", desc="training", mininterval=5.0, leave=False)
+    state.model.train()
+    while (progress := config.progress(state.step, state.seconds)) < 1.0:
+        batch = next(batches)
+        rate = config.rate(progress)
+        for group in state.optimizer.param_groups:
+            group["lr"] = rate
+        torch.manual_seed(_seed(config.seed, state.step))  # dropout
+        with _autocast(config):
+            loss, figures = compute_loss(batch)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip)
+        state.optimizer.step()
+        state.optimizer.zero_grad(set_to_none=True)
+        state.step += 1
+        state.update_average(config.ema_decay)
+        state.seconds = time.perf_counter() - start
+        bar.update(int(1000 * progress) - bar.n)
+        if state.step % config.log_every == 0:
+            elapsed, mark = time.perf_counter() - mark, time.perf_counter()
+            steps = min(config.log_every, state.step - first)
+            log.write(
+                step=state.step, minutes=state.seconds / 60.0, lr=rate, loss=loss, norm=norm,
+                samples_per_s=steps * _batch_size(training, config) / elapsed, **figures,
+            )  # fmt: skip
+        if state.step % config.validate_every == 0 and len(validation):
+            log.write(step=state.step, **_validate(state.averaged_model(), validation, config))
+            mark = time.perf_counter()
+        if time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
+            state.save(checkpoint)
+            state.averaged_model().save_pretrained(checkpoint.parent)
+            saved = mark = time.perf_counter()
+    bar.close()
+
+
+def _batch_size(training: HypothesisSet, config: TrainConfig) -> int:
+    return min(config.batch_size, len(training))
+
+
+def _batches(training: HypothesisSet, step: int, config: TrainConfig) -> Iterator[Any]:
+    """Endless batches from ``step`` on; each epoch in its own order, a last partial batch dropped."""
+    size = _batch_size(training, config)
+    per_epoch = len(training) // size
+    generator, epoch, order = torch.Generator(), -1, torch.empty(0)
+    while True:
+        if step // per_epoch != epoch:
+            epoch = step // per_epoch
+            generator.manual_seed(_seed(config.seed, -1 - epoch))
+            order = torch.randperm(len(training), generator=generator)
+        first = step % per_epoch * size
+        generator.manual_seed(_seed(config.seed, step))
+        index = order[first : first + size]
+        batch = training.batch(index, generator if config.augment else None)
+        yield batch.to(config.device) if config.device != "cpu" else batch
+        step += 1
+
+
+def _seed(seed: int, step: int) -> int:
+    """Seeds of the steps (not negative) and of the epochs' orders (negative) never coincide."""
+    return seed * 2**32 + step % 2**32
+
+
+@torch.no_grad()
+def _validate(model: ART, validation: HypothesisSet, config: TrainConfig) -> dict[str, float]:
+    """Mean figures over the held-out problems (at most 4,096), names prefixed by ``val_``."""
+    count = min(len(validation), 4096)
+    sums: dict[str, float] = {}
+    for index in torch.arange(count).split(512):
+        batch = validation.batch(index, None)
+        with _autocast(config):
+            loss, figures = model.net.loss(batch.to(config.device))
+        for name, value in {"loss": loss, **figures}.items():
+            sums[name] = sums.get(name, 0.0) + float(value) * len(index)
+    return {f"val_{name}": value / count for name, value in sums.items()}
+
+
+def _autocast(config: TrainConfig) -> torch.autocast:
+    kind = torch.device(config.device).type
+    enabled = config.precision == "bfloat16"
+    if config.precision == "auto":
+        enabled = kind == "cuda" or torch.cpu._is_avx512_bf16_supported()
+    return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
+
+
+class _Log:
+    """JSON lines; of a resumed run, lines past the checkpoint are dropped first."""
+
+    def __init__(self, path: Path, step: int) -> None:
+        self._path = path
+        lines = path.read_text("utf-8").splitlines() if step and path.exists() else []
+        kept = [line for line in lines if json.loads(line)["step"] <= step]
+        path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
+    def write(self, **figures: Any) -> None:
+        row = {name: _plain(value) for name, value in figures.items()}
+        with self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+        logger.info(" ".join(f"{name}={value:.4g}" for name, value in row.items()))
+
+
+def _plain(value: Any) -> float | int:
+    value = value.detach() if isinstance(value, Tensor) else value
+    return value if isinstance(value, int) else round(float(value), 6)

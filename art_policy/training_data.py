@@ -1,0 +1,103 @@
+"""Training examples as tensors, built once, so that an epoch is nothing but tensor work."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from art_policy.multi_hypothesis import HypothesisBatch
+from art_policy.sequence import ProblemBatch
+from freeflyer_env.robot import FloatArray
+from freeflyer_env.scenario import Scenario
+
+if TYPE_CHECKING:
+    from freeflyer_datasets.loading import PackedDataset
+
+_LABEL_SCP = 1
+_CHUNK = 4096  # trajectories that are rolled out at once
+
+
+class HypothesisSet:
+    """Problems with their distinct optima as paths, for the multi-hypothesis head.
+
+    Args:
+        dataset: Source; problems without a solved trajectory are left out.
+        trajectories: Indices of the trajectories to use.
+        table: Size of the table in m, for augmentation.
+        n_samples: Number ``S`` of equally spaced times at which a path is compared.
+        max_optima: Most optima ``R`` of one problem that are used, cheapest first.
+    """
+
+    def __init__(
+        self,
+        dataset: PackedDataset,
+        trajectories: np.ndarray,
+        table: tuple[float, float],
+        n_samples: int = 64,
+        max_optima: int = 4,
+    ) -> None:
+        label, rank = np.asarray(dataset.label), np.asarray(dataset.rank)
+        chosen = trajectories[
+            (label[trajectories] == _LABEL_SCP) & (rank[trajectories] < max_optima)
+        ]
+        problems, slot = np.unique(np.asarray(dataset.problem_index)[chosen], return_inverse=True)
+        n_optima = int(rank[chosen].max(initial=0)) + 1
+        paths = np.zeros((len(problems), n_optima, n_samples, 3), dtype=np.float32)
+        costs = np.full((len(problems), n_optima), np.inf, dtype=np.float32)
+        for part, states in rollouts(dataset, chosen):
+            paths[slot[part], rank[chosen[part]]] = deviations(states[:, :-1, :3], n_samples)
+        costs[slot, rank[chosen]] = dataset.cost[chosen]
+        # Without its cheapest optimum (beyond the chosen ranks, say) a problem teaches nothing.
+        usable = np.isfinite(costs[:, 0])
+        self._problems = problem_batch(dataset, problems[usable])
+        self._paths = torch.from_numpy(paths[usable])
+        self._costs = torch.from_numpy(costs[usable])
+        self._table = table
+
+    def __len__(self) -> int:
+        return len(self._problems)
+
+    def batch(self, index: Tensor, generator: torch.Generator | None) -> HypothesisBatch:
+        """The examples ``index``, each under a random symmetry if a ``generator`` is given."""
+        examples = HypothesisBatch(self._problems[index], self._paths[index], self._costs[index])
+        return examples.augmented(self._table, generator) if generator else examples
+
+
+def problem_batch(dataset: PackedDataset, problems: np.ndarray) -> ProblemBatch:
+    """The problems of these indices, with keep-out radii in place of radii."""
+    scenario = Scenario()
+    rows = np.array(dataset.obstacles[problems], dtype=np.float64)
+    radius = (rows[..., 2] + scenario.robot.radius) * scenario.keep_out_factor
+    rows[..., 2] = np.where(rows[..., 2] > 0.0, radius, 0.0)
+    columns = (dataset.start[problems], dataset.goal[problems], rows, dataset.final_time[problems])
+    return ProblemBatch(*(torch.from_numpy(np.asarray(c, dtype=np.float32)) for c in columns))
+
+
+def rollouts(
+    dataset: PackedDataset, trajectories: np.ndarray
+) -> Iterator[tuple[np.ndarray, FloatArray]]:
+    """States of trajectories in chunks of equal length.
+
+    Yields:
+        Positions within ``trajectories`` ``(C,)``, and their states ``(C, N + 1, 6)``.
+    """
+    n_steps = np.diff(dataset.offsets)[trajectories]
+    for length in np.unique(n_steps):
+        same = np.flatnonzero(n_steps == length)
+        for first in range(0, len(same), _CHUNK):
+            part = same[first : first + _CHUNK]
+            yield part, dataset.states(trajectories[part])
+
+
+def deviations(poses: FloatArray, n_samples: int) -> FloatArray:
+    """Deviation of node poses ``(B, N, 3)`` from the straight line, resampled: ``(B, S, 3)``."""
+    share = np.linspace(0.0, 1.0, poses.shape[1])[:, None]
+    away = poses - (1.0 - share) * poses[:, :1] - share * poses[:, -1:]
+    position = np.linspace(0.0, poses.shape[1] - 1.0, n_samples)
+    left = np.minimum(position.astype(int), poses.shape[1] - 2)
+    weight = (position - left)[:, None]
+    return (1.0 - weight) * away[:, left] + weight * away[:, left + 1]
