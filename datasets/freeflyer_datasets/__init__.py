@@ -13,8 +13,8 @@ from freeflyer_datasets.recipe import Recipe, list_recipes, load_recipe
 from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 
 if TYPE_CHECKING:
-    from freeflyer_datasets.loading import PackedDataset
     from freeflyer_datasets.export import build
+    from freeflyer_datasets.loading import PackedDataset
 
 __all__ = [
     "LABEL_REL",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
 import json
 import logging
@@ -137,7 +138,7 @@ def environment_spec(recipe: Recipe, *, evaluation: bool = False) -> EnvSpec:
             is to be judged, instead of the bare objective.
     """
     one_scene = recipe.scenes[0] if len(set(recipe.scenes)) == 1 else "random"
-    spec = gym.spec("FreeFlyer-v0")
+    spec = copy.deepcopy(gym.spec("FreeFlyer-v0"))
     kwargs: dict[str, Any] = {
         "action_mode": "delta_v",
         "scenario": "random" if recipe.scenes == "random" else one_scene,
@@ -146,7 +147,8 @@ def environment_spec(recipe: Recipe, *, evaluation: bool = False) -> EnvSpec:
     }
     if not evaluation:
         kwargs |= {"success_reward": 0.0, "terminate_early": False}
-    return EnvSpec(id=spec.id, entry_point=spec.entry_point, kwargs=kwargs)
+    spec.kwargs = kwargs
+    return spec
 
 
 def _write_dataset(

@@ -111,14 +111,15 @@ def generate(
     _write_recipe(folder, recipe)
     missing, kept, damaged = _missing_shards(folder, recipe, n_problems)
     bar = tqdm(total=n_problems, unit="problem", disable=not progress, smoothing=0.1)
-    bar.update(n_problems - sum(count for _, count in missing))
+    bar.update(n_problems - sum(count for *_, count in missing))
     n_trajectories, failed = 0, []
     with bar, joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(
             n_jobs=workers or joblib.cpu_count(), return_as="generator_unordered"
         )
         jobs = (
-            joblib.delayed(_make_shard)(folder, recipe, number, count) for number, count in missing
+            joblib.delayed(_make_shard)(shard_path(folder, number), recipe, first, count)
+            for number, first, count in missing
         )
         for count, trajectories, failures in parallel(jobs):
             bar.update(count)
@@ -243,11 +244,8 @@ def _pack(
     )
 
 
-def _make_shard(
-    folder: Path, recipe: Recipe, number: int, count: int
-) -> tuple[int, int, list[int]]:
+def _make_shard(path: Path, recipe: Recipe, first: int, count: int) -> tuple[int, int, list[int]]:
     """Makes one shard in a worker; returns how many problems and trajectories, and failures."""
-    first = number * SHARD_SIZE
     shard = solve_problems(recipe, first, count)
     failed = [first + int(local) for local in np.flatnonzero(shard.failure != "")]
     if len(failed) == count:
@@ -255,40 +253,35 @@ def _make_shard(
             f"All {count} problems from {first} on failed, so the shard was not written. "
             f"The first one: {shard.failure[0]}"
         )
-    write_shard(shard_path(folder, number), shard)
+    write_shard(path, shard)
     return count, shard.n_trajectories, failed
 
 
 def _missing_shards(
     folder: Path, recipe: Recipe, n_problems: int
-) -> tuple[list[tuple[int, int]], int, list[str]]:
-    """Number and size of the shards to make; how many are kept; names of the damaged ones."""
-    missing: list[tuple[int, int]] = []
+) -> tuple[list[tuple[int, int, int]], int, list[str]]:
+    """Number, first problem and size of the shards to make; how many are kept; the damaged ones."""
+    missing: list[tuple[int, int, int]] = []
     damaged: list[str] = []
     kept = 0
-    for number in range(-(-n_problems // SHARD_SIZE)):
-        path = shard_path(folder, number)
-        count = min(SHARD_SIZE, n_problems - number * SHARD_SIZE)
+    for number, first in enumerate(range(0, n_problems, SHARD_SIZE)):
+        path, count = shard_path(folder, number), min(SHARD_SIZE, n_problems - first)
         try:
             shard = read_shard(path)
+            if shard.fingerprint != recipe.fingerprint:
+                raise _other_recipe(folder, path.name)
+            if shard.first != first or shard.n_problems > SHARD_SIZE:
+                raise ShardError(f"{path.name} holds other problems than it should.")
+            if shard.n_problems >= count:
+                kept += 1
+                continue
+            # The last shard of a shorter run.
         except FileNotFoundError:
-            missing.append((number, count))
-            continue
+            pass
         except ShardError as error:
             logger.warning("%s It is made again.", error)
             damaged.append(path.name)
-            missing.append((number, count))
-            continue
-        if shard.fingerprint != recipe.fingerprint:
-            raise _other_recipe(folder, path.name)
-        if shard.first != number * SHARD_SIZE or shard.n_problems > SHARD_SIZE:
-            logger.warning("%s has other problems than it should; it is made again.", path.name)
-            damaged.append(path.name)
-            missing.append((number, count))
-        elif shard.n_problems < count:  # the last shard of a shorter run
-            missing.append((number, count))
-        else:
-            kept += 1
+        missing.append((number, first, count))
     return missing, kept, damaged
 
 

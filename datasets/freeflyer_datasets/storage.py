@@ -1,7 +1,7 @@
 """Storage: episodes in Minari's HDF5 layout, written directly with h5py.
 
-Minari's own writer takes any array that it is given and needs five times the space, so episodes are
-checked here before they are written, and the fields that are constant over an episode are compressed.
+Minari's own writer takes any array that it is given and needs five times the space, so episodes
+are checked here before they are written, and the fields that are constant over one are compressed.
 One group an episode::
 
     episode_7                     attributes: id, total_steps and those of EPISODE_ATTRIBUTES
@@ -97,10 +97,10 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
         }
         yield Episode(
             observations={
-                "state": np.float32(states),
-                "goal": np.repeat(np.float32(shard.goal[local])[None], repeat, axis=0),
-                "obstacles": np.repeat(np.float32(shard.obstacles[local])[None], repeat, axis=0),
-                "time_to_go": np.float32(time_to_go),
+                "state": states.astype(np.float32),
+                "goal": _repeated(shard.goal[local], repeat),
+                "obstacles": _repeated(shard.obstacles[local], repeat),
+                "time_to_go": time_to_go.astype(np.float32),
             },
             actions=controls,
             rewards=-np.abs(controls.astype(np.float64)).sum(axis=1),
@@ -115,6 +115,10 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
                 "c_rel": shard.c_rel[local].item(),
             },
         )
+
+
+def _repeated(value: NDArray[np.float64], count: int) -> NDArray[np.float32]:
+    return np.repeat(value.astype(np.float32)[None], count, axis=0)
 
 
 def check_episode(
