@@ -111,15 +111,15 @@ def generate(
     _write_recipe(folder, recipe)
     missing, kept, damaged = _missing_shards(folder, recipe, n_problems)
     bar = tqdm(total=n_problems, unit="problem", disable=not progress, smoothing=0.1)
-    bar.update(n_problems - sum(count for *_, count in missing))
+    bar.update(n_problems - sum(count for _, count in missing))
     n_trajectories, failed = 0, []
     with bar, joblib.parallel_config(backend="loky", inner_max_num_threads=1):
         parallel = joblib.Parallel(
             n_jobs=workers or joblib.cpu_count(), return_as="generator_unordered"
         )
         jobs = (
-            joblib.delayed(_make_shard)(shard_path(folder, number), recipe, first, count)
-            for number, first, count in missing
+            joblib.delayed(_make_shard)(folder, recipe, number, count, SHARD_SIZE)
+            for number, count in missing
         )
         for count, trajectories, failures in parallel(jobs):
             bar.update(count)
@@ -244,8 +244,11 @@ def _pack(
     )
 
 
-def _make_shard(path: Path, recipe: Recipe, first: int, count: int) -> tuple[int, int, list[int]]:
+def _make_shard(
+    folder: Path, recipe: Recipe, number: int, count: int, shard_size: int = SHARD_SIZE
+) -> tuple[int, int, list[int]]:
     """Makes one shard in a worker; returns how many problems and trajectories, and failures."""
+    first = number * shard_size
     shard = solve_problems(recipe, first, count)
     failed = [first + int(local) for local in np.flatnonzero(shard.failure != "")]
     if len(failed) == count:
@@ -253,15 +256,15 @@ def _make_shard(path: Path, recipe: Recipe, first: int, count: int) -> tuple[int
             f"All {count} problems from {first} on failed, so the shard was not written. "
             f"The first one: {shard.failure[0]}"
         )
-    write_shard(path, shard)
+    write_shard(shard_path(folder, number), shard)
     return count, shard.n_trajectories, failed
 
 
 def _missing_shards(
     folder: Path, recipe: Recipe, n_problems: int
-) -> tuple[list[tuple[int, int, int]], int, list[str]]:
-    """Number, first problem and size of the shards to make; how many are kept; the damaged ones."""
-    missing: list[tuple[int, int, int]] = []
+) -> tuple[list[tuple[int, int]], int, list[str]]:
+    """Number and size of the shards to make; how many are kept; names of the damaged ones."""
+    missing: list[tuple[int, int]] = []
     damaged: list[str] = []
     kept = 0
     for number, first in enumerate(range(0, n_problems, SHARD_SIZE)):
@@ -281,7 +284,7 @@ def _missing_shards(
         except ShardError as error:
             logger.warning("%s It is made again.", error)
             damaged.append(path.name)
-        missing.append((number, first, count))
+        missing.append((number, count))
     return missing, kept, damaged
 
 
