@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
 
 import pytest
 from freeflyer_datasets import Recipe, generate
 
 SHARD_SIZE = 4
+
+# The package's attribute of this name is the function.
+GENERATE_MODULE = importlib.import_module("freeflyer_datasets.generate")
 
 
 @pytest.fixture(scope="session")
@@ -27,7 +31,7 @@ def recipe() -> Recipe:
 @pytest.fixture(autouse=True)
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shards of four problems."""
-    monkeypatch.setattr("freeflyer_datasets.generate.SHARD_SIZE", SHARD_SIZE)
+    monkeypatch.setattr(GENERATE_MODULE, "SHARD_SIZE", SHARD_SIZE)
 
 
 @pytest.fixture(scope="session")
@@ -35,7 +39,7 @@ def shards(recipe: Recipe, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with three shards; tests must not change it."""
     folder = tmp_path_factory.mktemp("shards")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("freeflyer_datasets.generate.SHARD_SIZE", SHARD_SIZE)
+        patch.setattr(GENERATE_MODULE, "SHARD_SIZE", SHARD_SIZE)
         generate(recipe, folder, workers=1, progress=False)
     return folder
 
