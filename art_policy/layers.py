@@ -104,10 +104,22 @@ class ARTConfig:
 
 @dataclass
 class KeyValueCache:
-    """Keys and values of the tokens seen so far, one pair ``(B, heads, L, width / heads)`` a layer."""
+    """Keys and values of the tokens seen so far, each ``(B, heads, L, width / heads)``, by layer."""
 
     keys: list[Tensor] = dataclasses.field(default_factory=list)
     values: list[Tensor] = dataclasses.field(default_factory=list)
+
+    @property
+    def length(self) -> int:
+        """Number of tokens stored."""
+        return self.keys[0].shape[2] if self.keys else 0
+
+    def forget(self, keep: int) -> None:
+        """Drops all but the last ``keep`` tokens."""
+        if self.length > keep:
+            first = self.length - keep
+            self.keys = [key[:, :, first:] for key in self.keys]
+            self.values = [value[:, :, first:] for value in self.values]
 
     def extend(self, layer: int, key: Tensor, value: Tensor) -> tuple[Tensor, Tensor]:
         """Appends along time and returns everything stored for ``layer``."""
@@ -118,11 +130,6 @@ class KeyValueCache:
             self.keys[layer] = torch.cat([self.keys[layer], key], dim=2)
             self.values[layer] = torch.cat([self.values[layer], value], dim=2)
         return self.keys[layer], self.values[layer]
-
-    @property
-    def length(self) -> int:
-        """Number of tokens stored."""
-        return self.keys[0].shape[2] if self.keys else 0
 
 
 class Attention(nn.Module):
@@ -147,9 +154,9 @@ class Attention(nn.Module):
 
         Args:
             x: Tokens.
-            mask: ``(B, 1, L or 1, L)`` bool, True where attention is allowed.
-            causal: Whether a token sees only itself and earlier ones.
-            cache: Past of all layers; extended.
+            mask: Bool, broadcast to ``(B, heads, L, L + past)``, True where attention is allowed.
+            causal: Whether a token sees only itself and earlier ones (without a past).
+            cache: Past of all layers; extended by these tokens.
             layer: Index of this layer in the cache.
             n_queries: If given, only the first tokens attend, and only their outputs are returned.
         """
@@ -157,12 +164,7 @@ class Attention(nn.Module):
         qkv = self.qkv(x).view(batch, length, 3, self.n_heads, width // self.n_heads)
         q, k, v = qkv.permute(2, 0, 3, 1, 4)  # each (B, heads, L, width / heads)
         if cache is not None:
-            past = cache.length if layer < len(cache.keys) else 0
             k, v = cache.extend(layer, k, v)
-            if causal and past:
-                # The new tokens see the whole past, and one another causally.
-                ones = torch.ones(length, past + length, dtype=torch.bool, device=x.device)
-                mask, causal = ones.tril(past), False
         q = q[:, :, :n_queries]
         dropout = self.dropout if self.training else 0.0
         y = F.scaled_dot_product_attention(

@@ -11,6 +11,7 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import nn
 
+from art_policy.autoregressive import Autoregressive
 from art_policy.layers import ARTConfig
 from art_policy.multi_hypothesis import MultiHypothesis
 
@@ -32,7 +33,8 @@ class ART(nn.Module):
     def __init__(self, config: ARTConfig) -> None:
         super().__init__()
         self.config = config
-        self.net: nn.Module = MultiHypothesis(config)
+        heads = {"multi_hypothesis": MultiHypothesis, "autoregressive": Autoregressive}
+        self.net: MultiHypothesis | Autoregressive = heads[config.head](config)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """The head's forward pass."""

@@ -8,9 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from art_policy.multi_hypothesis import MultiHypothesis, interpolation_matrix
+from art_policy.autoregressive import Autoregressive
+from art_policy.layers import KeyValueCache
+from art_policy.multi_hypothesis import interpolation_matrix
 from art_policy.sequence import ProblemBatch
+from freeflyer_env import constraints, dynamics
 from freeflyer_env.planning.multistart import push_out
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
@@ -57,12 +61,20 @@ def propose_batch(
     """As :func:`propose`, for many problems in one pass.
 
     Raises:
-        ValueError: If ``n_candidates`` is not positive.
+        ValueError: If ``n_candidates`` is not positive, or REL's trajectories are missing where the
+            model needs them.
     """
     if n_candidates < 1:
         raise ValueError(f"n_candidates must be at least 1, got {n_candidates}.")
     if not problems:
         return []
+    if isinstance(model.net, Autoregressive):
+        if rels is None or len(rels) != len(problems):
+            raise ValueError(
+                "An autoregressive model needs REL's trajectory of each problem for its "
+                "reward-to-go; pass rel=solve_rel(problem).trajectory."
+            )
+        return _sequences(model.net, problems, n_candidates, [rel.cost for rel in rels])
     return _hypotheses(model, problems, n_candidates)
 
 
@@ -103,3 +115,101 @@ def decode_poses(problem: Problem, knots: FloatArray) -> FloatArray:
     poses[..., :2] = push_out(problem.scenario, poses[..., :2])
     poses[:, 0], poses[:, -1] = problem.start[:3], problem.goal[:3]
     return poses
+
+
+#: Candidates of an autoregressive model ask for REL's cost times 1, 1.05, 1.1 ...: REL's cost is a
+#: lower bound, which the obstacles may put out of reach.
+_COST_STEP = 0.05
+
+
+def _sequences(
+    net: Autoregressive, problems: Sequence[Problem], n_candidates: int, rel_costs: Sequence[float]
+) -> list[list[Proposal]]:
+    factors = 1.0 + _COST_STEP * np.arange(n_candidates)
+    tasks = [problem for problem in problems for _ in factors]
+    returns = -np.outer(rel_costs, factors).ravel()
+    proposals = [
+        _judge(problem, Trajectory.from_controls(problem, controls))
+        for problem, controls in zip(tasks, generate(net, tasks, returns))
+    ]
+    groups = [proposals[i : i + n_candidates] for i in range(0, len(proposals), n_candidates)]
+    return [sorted(group, key=lambda proposal: -proposal.score) for group in groups]
+
+
+def _judge(problem: Problem, trajectory: Trajectory) -> Proposal:
+    """Scores a generated trajectory by its violating nodes and its miss of the goal."""
+    miss = np.linalg.norm(trajectory.states[-1, :2] - problem.goal[:2])
+    return Proposal(trajectory, -float(trajectory.violations(problem).sum() + 10.0 * miss))
+
+
+@torch.inference_mode()
+def generate(
+    net: Autoregressive,
+    problems: Sequence[Problem],
+    returns_to_go: FloatArray,
+    *,
+    use_cache: bool = True,
+) -> list[FloatArray]:
+    """Model-based autoregressive generation (paper, Sec. III-C): the known dynamics give the states.
+
+    Args:
+        net: The network.
+        problems: ``B`` problems; their final times may differ.
+        returns_to_go: ``(B,)`` rewards-to-go at the start, minus the cost asked for, in m/s.
+        use_cache: Whether to keep keys and values of the past, or to run the whole sequence again at
+            every step (slow; the same result).
+
+    Returns:
+        Controls ``(N, 3)`` of each problem, within the actuation limit.
+    """
+    device = net.control_scale.device
+    batch = ProblemBatch.from_problems(problems).to(device)
+    dt = np.array([problem.scenario.dt for problem in problems])
+    robot = problems[0].scenario.robot
+    state = np.array([problem.start for problem in problems])
+    time_to_go = np.array([problem.final_time for problem in problems])
+    returns, budget = np.array(returns_to_go, dtype=np.float64), np.zeros(len(problems))
+    cache = KeyValueCache() if use_cache else None
+    tokens, controls = torch.empty(len(problems), 0, net.config.width, device=device), []
+    for _ in range(max(problem.n_steps for problem in problems)):
+        inputs = (_column(x, device) for x in (state, returns, budget, time_to_go))
+        new = net.embed_descriptors(batch, *inputs).flatten(1, 2)
+        tokens = torch.cat([tokens, new], dim=1)
+        x = net.transform(tokens, cache)[:, -1]
+        control = (net.control_decoder(x) * net.control_scale).double().cpu().numpy()
+        control = _within_limits(problems, state, control)
+        last = net.embed_controls(_column(control, device), _column(time_to_go, device))
+        last = last.flatten(1, 2)
+        tokens = last if use_cache else torch.cat([tokens, last], dim=1)
+        # Budgets are spent as the paper says, but not overdrawn, which no example ever was.
+        budget = np.maximum(budget - _violating(problems, state, control), 0.0)
+        returns = np.minimum(returns + np.abs(control).sum(axis=1), 0.0)
+        state = dynamics.step(state, control, dt[:, None], robot)
+        time_to_go = time_to_go - dt
+        controls.append(control)
+    table = np.stack(controls, axis=1)  # (B, longest N, 3)
+    return [row[: problem.n_steps] for row, problem in zip(table, problems)]
+
+
+def _column(values: FloatArray, device: torch.device) -> Tensor:
+    """``(B, ...)`` numbers as a float32 sequence of one step, ``(B, 1, ...)``."""
+    return torch.as_tensor(values[:, None], dtype=torch.float32, device=device)
+
+
+def _within_limits(
+    problems: Sequence[Problem], state: FloatArray, control: FloatArray
+) -> FloatArray:
+    """Controls ``(B, 3)`` scaled down to the actuation limit at the states ``(B, 6)``."""
+    limit = np.array([p.scenario.robot.delta_v_max(p.scenario.dt) for p in problems])
+    clusters = problems[0].scenario.robot.cluster_delta_v(state[:, 2], control)
+    return control / np.maximum(np.abs(clusters).max(axis=1) / limit, 1.0)[:, None]
+
+
+def _violating(problems: Sequence[Problem], states: FloatArray, controls: FloatArray) -> FloatArray:
+    """The paper's indicator (eq. 6) at one node of each problem, ``(B,)``."""
+    return np.array(
+        [
+            constraints.violations(problem.scenario, np.stack([state, state]), control[None])[0]
+            for problem, state, control in zip(problems, states, controls)
+        ]
+    )

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from freeflyer_env.robot import Robot
 from freeflyer_env.scenario import Problem
 
 #: What mirroring in x or in y does to the signs of a state and of a control.
@@ -111,3 +112,112 @@ class ProblemBatch:
 def random_flags(batch: int, generator: torch.Generator) -> Tensor:
     """``(batch,)`` fair coin tosses."""
     return torch.rand(batch, generator=generator) < 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class SequenceBatch:
+    """Windows of ``L`` steps of trajectories, with what the paper's eq. 3 puts at each step.
+
+    Attributes:
+        problems: The ``B`` problems.
+        states: ``(B, L, 6)`` states before each impulse.
+        controls: ``(B, L, 3)`` impulses per unit mass.
+        next_states: ``(B, L, 6)`` states one step later.
+        returns_to_go: ``(B, L)`` minus the cost from here on, in m/s (eq. 5).
+        constraints_to_go: ``(B, L)`` violating nodes from here on (eq. 5, 6).
+        time_to_go: ``(B, L)`` in s.
+        valid: ``(B, L)`` False where a trajectory is shorter than the window.
+    """
+
+    problems: ProblemBatch
+    states: Tensor
+    controls: Tensor
+    next_states: Tensor
+    returns_to_go: Tensor
+    constraints_to_go: Tensor
+    time_to_go: Tensor
+    valid: Tensor
+
+    def __len__(self) -> int:
+        return len(self.states)
+
+    def to(self, device: torch.device | str) -> SequenceBatch:
+        """The same on another device."""
+        return SequenceBatch(*(getattr(self, item.name).to(device) for item in fields(self)))
+
+    @classmethod
+    def from_controls(
+        cls,
+        problems: ProblemBatch,
+        controls: Tensor,
+        n_steps: Tensor,
+        dt: float,
+        robot: Robot,
+    ) -> SequenceBatch:
+        """Whole trajectories from their controls.
+
+        Args:
+            problems: The ``B`` problems.
+            controls: ``(B, L, 3)``, zero beyond the end.
+            n_steps: ``(B,)`` number of controls of each.
+            dt: Step in s.
+            robot: Gives ``m / J``.
+        """
+        gain = controls.new_tensor(robot.control_gain)
+        after = problems.start[:, None, 3:] + (controls * gain).cumsum(1)  # rates after impulses
+        way = dt * after.cumsum(1)
+        poses = torch.cat([torch.zeros_like(way[:, :1]), way[:, :-1]], dim=1)
+        poses = problems.start[:, None, :3] + poses
+        rates = torch.cat([problems.start[:, None, 3:], after[:, :-1]], dim=1)
+        step = torch.arange(controls.shape[1], device=controls.device)
+        valid = step < n_steps[:, None]
+        inside = keep_out_depth(problems.discs, poses[..., :2]) > KEEP_OUT_TOLERANCE
+        return cls(
+            problems,
+            torch.cat([poses, rates], dim=2),
+            controls,
+            torch.cat([poses + dt * after, after], dim=2),
+            _to_go(-controls.abs().sum(2)),
+            _to_go((inside & valid).float()),
+            problems.final_time[:, None] - dt * step,
+            valid,
+        )
+
+    def window(self, first: Tensor, length: int) -> SequenceBatch:
+        """The ``length`` steps that begin at ``first`` ``(B,)``."""
+        index = first[:, None] + torch.arange(length, device=first.device)
+        inside = index < self.valid.shape[1]
+        index = index.clamp(max=self.valid.shape[1] - 1)
+        rows = torch.arange(len(self), device=first.device)[:, None]
+        parts = [getattr(self, item.name)[rows, index] for item in fields(self)[1:-1]]
+        return SequenceBatch(self.problems, *parts, self.valid[rows, index] & inside)
+
+
+#: Depth in m from which a node of a float32 rollout counts as inside a keep-out disc. Solutions touch
+#: the discs to rounding; nodes of relaxed trajectories are centimetres inside.
+KEEP_OUT_TOLERANCE = 1e-4
+
+
+def keep_out_depth(discs: Tensor, positions: Tensor) -> Tensor:
+    """How deep positions ``(B, L, 2)`` are inside the discs ``(B, M, 3)``, ``(B, L)`` in m.
+
+    As :func:`freeflyer_env.constraints.keep_out_depth`, for a scene per row; padding is ignored.
+    """
+    if not discs.shape[1]:
+        return torch.full_like(positions[..., 0], -torch.inf)
+    gaps = (positions[:, :, None] - discs[:, None, :, :2]).norm(dim=3)  # (B, L, M)
+    depth = discs[:, None, :, 2] - gaps
+    return depth.masked_fill(discs[:, None, :, 2] <= 0.0, -torch.inf).amax(2)
+
+
+def reverse_controls(controls: Tensor, n_steps: Tensor) -> Tensor:
+    """Controls ``(B, L, 3)`` of the time-reversed and x-mirrored trajectories of ``n_steps`` each."""
+    index = n_steps[:, None] - 1 - torch.arange(controls.shape[1])
+    rows = torch.arange(len(controls))[:, None]
+    flipped = controls[rows, index.clamp(min=0)] * controls.new_tensor(REVERSE_CONTROL)
+    return flipped * (index >= 0)[..., None]
+
+
+def _to_go(values: Tensor) -> Tensor:
+    """Sums from each step to the end, along the last axis."""
+    return values.flip(-1).cumsum(-1).flip(-1)

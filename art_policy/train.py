@@ -19,16 +19,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
 
+from art_policy.autoregressive import Autoregressive
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
-from art_policy.training_data import HypothesisSet
+from art_policy.training_data import HypothesisSet, SequenceSet
 
 if TYPE_CHECKING:
     from freeflyer_datasets.loading import PackedDataset
+
+ExampleSet = HypothesisSet | SequenceSet
 
 logger = logging.getLogger(__name__)
 
@@ -178,6 +182,7 @@ class _State:
     def averaged_model(self) -> ART:
         """A copy of the model with the averaged weights, for validation and release."""
         model = ART(self.model.config).to(self.model.device)
+        model.load_state_dict(self.model.state_dict())
         with torch.no_grad():
             for parameter, value in zip(model.parameters(), self.average):
                 parameter.copy_(value)
@@ -218,12 +223,14 @@ def train(
     if config.threads:
         torch.set_num_threads(config.threads)
     training, validation = (
-        HypothesisSet(dataset, part, model_config.table)
-        for part in dataset.split(config.validation_fraction)
+        _examples(dataset, part, model_config) for part in dataset.split(config.validation_fraction)
     )
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
     state = _State.create(model_config, config)
+    if isinstance(state.model.net, Autoregressive):
+        sample = training.batch(torch.arange(min(len(training), 2048)), torch.Generator())
+        state.model.net.fit_scales(sample)
     checkpoint = out / CHECKPOINT_NAME
     if resume and checkpoint.exists():
         state.load(checkpoint)
@@ -244,8 +251,8 @@ def train(
 
 def _loop(
     state: _State,
-    training: HypothesisSet,
-    validation: HypothesisSet,
+    training: ExampleSet,
+    validation: ExampleSet,
     config: TrainConfig,
     log: _Log,
     checkpoint: Path,
@@ -291,11 +298,17 @@ def _loop(
     bar.close()
 
 
-def _batch_size(training: HypothesisSet, config: TrainConfig) -> int:
+def _examples(dataset: PackedDataset, trajectories: np.ndarray, config: ARTConfig) -> ExampleSet:
+    if config.head == "autoregressive":
+        return SequenceSet(dataset, trajectories, config.table, config.context_length)
+    return HypothesisSet(dataset, trajectories, config.table)
+
+
+def _batch_size(training: ExampleSet, config: TrainConfig) -> int:
     return min(config.batch_size, len(training))
 
 
-def _batches(training: HypothesisSet, step: int, config: TrainConfig) -> Iterator[Any]:
+def _batches(training: ExampleSet, step: int, config: TrainConfig) -> Iterator[Any]:
     """Endless batches from ``step`` on; each epoch in its own order, a last partial batch dropped."""
     size = _batch_size(training, config)
     per_epoch = len(training) // size
@@ -319,7 +332,7 @@ def _seed(seed: int, step: int) -> int:
 
 
 @torch.no_grad()
-def _validate(model: ART, validation: HypothesisSet, config: TrainConfig) -> dict[str, float]:
+def _validate(model: ART, validation: ExampleSet, config: TrainConfig) -> dict[str, float]:
     """Mean figures over the held-out problems (at most 4,096), names prefixed by ``val_``."""
     count = min(len(validation), 4096)
     sums: dict[str, float] = {}

@@ -10,7 +10,13 @@ import torch
 from torch import Tensor
 
 from art_policy.multi_hypothesis import HypothesisBatch
-from art_policy.sequence import ProblemBatch
+from art_policy.sequence import (
+    MIRROR_CONTROL,
+    ProblemBatch,
+    SequenceBatch,
+    random_flags,
+    reverse_controls,
+)
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Scenario
 
@@ -65,6 +71,59 @@ class HypothesisSet:
         """The examples ``index``, each under a random symmetry if a ``generator`` is given."""
         examples = HypothesisBatch(self._problems[index], self._paths[index], self._costs[index])
         return examples.augmented(self._table, generator) if generator else examples
+
+
+class SequenceSet:
+    """Trajectories, relaxed and optimal, in windows for the autoregressive head.
+
+    Args:
+        dataset: Source.
+        trajectories: Indices of the trajectories to use.
+        table: Size of the table in m, for augmentation.
+        length: Number of steps of a window, the model's context length.
+    """
+
+    def __init__(
+        self,
+        dataset: PackedDataset,
+        trajectories: np.ndarray,
+        table: tuple[float, float],
+        length: int,
+    ) -> None:
+        problems, slot = np.unique(dataset.problem_index[trajectories], return_inverse=True)
+        self._problems = problem_batch(dataset, problems)
+        self._slot = torch.from_numpy(slot)
+        self._first = torch.from_numpy(dataset.offsets[trajectories])
+        self._n_steps = torch.from_numpy(np.diff(dataset.offsets)[trajectories])
+        self._controls = dataset.controls
+        self._dt, self._robot = dataset.dt, dataset.robot
+        self._table, self._length = table, length
+
+    def __len__(self) -> int:
+        return len(self._slot)
+
+    def batch(self, index: Tensor, generator: torch.Generator | None) -> SequenceBatch:
+        """The trajectories ``index``; random symmetries and windows if a ``generator`` is given."""
+        problems, n_steps = self._problems[self._slot[index]], self._n_steps[index]
+        step = torch.arange(int(n_steps.max()))
+        inside = step < n_steps[:, None]
+        rows = torch.where(inside, self._first[index, None] + step, 0)
+        controls = torch.from_numpy(self._controls[rows.numpy()]) * inside[..., None]
+        if generator:
+            mirror, reverse = (random_flags(len(index), generator) for _ in range(2))
+            problems = problems.mirrored(mirror, self._table[1])
+            problems = problems.reversed(reverse, self._table[0])
+            flip = controls.new_tensor(MIRROR_CONTROL[1])
+            controls = torch.where(mirror[:, None, None], controls * flip, controls)
+            flipped = reverse_controls(controls, n_steps)
+            controls = torch.where(reverse[:, None, None], flipped, controls)
+        whole = SequenceBatch.from_controls(problems, controls, n_steps, self._dt, self._robot)
+        last = (n_steps - self._length).clamp(min=0)
+        share = (
+            torch.rand(len(index), generator=generator) if generator else torch.zeros(len(index))
+        )
+        first = (share * (last + 1)).long()
+        return whole.window(first, min(self._length, len(step)))
 
 
 def problem_batch(dataset: PackedDataset, problems: np.ndarray) -> ProblemBatch:
