@@ -136,10 +136,11 @@ Split by the attribute `problem_index`, never by episode.
 ## How it was made
 
 With freeflyer-gym {version}, seed {recipe.seed}, recipe `{name}`:
-`freeflyer_datasets.build("{name}")` makes it again. SCP was started from
-{_starts(recipe)}; kept is {_kept(recipe)}. Every trajectory was checked against the constraints by
-code that the solver does not share; the largest violation, with float32 actions, is
-{s.violation:.1e}.
+`freeflyer_datasets.build("{name}")` makes it again.
+SCP was started from {_starts(recipe)}.
+Kept is {_kept(recipe)} of each problem.
+Every trajectory was checked against the constraints by code that the solver does not share; the
+largest violation, with float32 actions, is {s.violation:.1e}.
 
 ## Licence and citation
 

@@ -52,7 +52,6 @@ EPISODE_ATTRIBUTES = {
 }
 
 _FILE_NAME = "main_data.hdf5"
-_INTEGERS = ("problem_index", "label", "rank", "success", "iterations", "start_number", "c_rel")
 _FLOATS = ("cost", "violation", "rel_cost")
 
 
@@ -257,33 +256,56 @@ def iterate_episodes(data_folder: Path) -> Iterator[dict[str, Any]]:
         data_folder: The ``data`` folder of a Minari dataset of this package.
 
     Yields:
-        ``controls`` (N, 3), the numbers among :data:`EPISODE_ATTRIBUTES`, and ``start``, ``goal``,
-        ``obstacles`` and ``final_time`` of the problem.
+        ``controls`` (N, 3) and the attributes ``problem_index``, ``label``, ``rank`` and ``cost``;
+        with the first episode of a problem also ``rel_cost``, ``c_rel`` and the problem's
+        ``start``, ``goal``, ``obstacles`` and ``final_time``.
 
     Raises:
         ValueError: If the dataset was not made by this package.
     """
+    previous: int | float = -1
     with h5py.File(data_folder / _FILE_NAME, "r") as file:
         for number in range(len(file)):
-            group = file[f"episode_{number}"]
             try:
-                episode = {name: _number(group, name) for name in (*_INTEGERS, *_FLOATS)}
-                first = {key: value[0] for key, value in group["observations"].items()}
-                episode["start"] = first["state"]
-                episode["goal"], episode["obstacles"] = first["goal"], first["obstacles"]
-                episode["final_time"] = first["time_to_go"][0]
+                group = h5g.open(file.id, b"episode_%d" % number)
+                names = ("problem_index", "label", "rank", "cost")
+                episode: dict[str, Any] = {name: _read_number(group, name) for name in names}
+                episode["controls"] = _read_array(group, b"actions")
+                if episode["problem_index"] != previous:
+                    previous = episode["problem_index"]
+                    episode |= {name: _read_number(group, name) for name in ("rel_cost", "c_rel")}
+                    episode |= _read_problem(group)
             except KeyError as error:
                 raise ValueError(
                     f"Episode {number} in {str(data_folder)!r} lacks {error}: not a dataset of "
                     f"freeflyer_datasets."
                 ) from error
-            episode["controls"] = group["actions"][()]
             yield episode
 
 
-def _number(group: h5py.Group, name: str) -> int | float:
-    value = np.empty((), dtype="<i4" if name in _INTEGERS else "<f8")
-    h5a.open(group.id, name.encode()).read(value)
+def _read_problem(group: Any) -> dict[str, Any]:
+    first = {
+        name: _read_array(group, b"observations/" + name.encode())[0]
+        for name in ("state", "goal", "obstacles", "time_to_go")
+    }
+    return {
+        "start": first["state"],
+        "goal": first["goal"],
+        "obstacles": first["obstacles"],
+        "final_time": first["time_to_go"][0],
+    }
+
+
+def _read_array(group: Any, name: bytes) -> NDArray[np.float32]:
+    dataset = h5d.open(group, name)
+    value = np.empty(dataset.shape, dtype="<f4")
+    dataset.read(h5s.ALL, h5s.ALL, value)
+    return value
+
+
+def _read_number(group: Any, name: str) -> int | float:
+    value = np.empty((), dtype="<f8" if name in _FLOATS else "<i4")
+    h5a.open(group, name.encode()).read(value)
     return value.item()
 
 
