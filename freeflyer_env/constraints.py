@@ -89,7 +89,7 @@ def violations(
     controls: FloatArray,
     tolerance: float = FEASIBILITY_TOLERANCE,
 ) -> FloatArray:
-    """The indicator ``C(t_i)`` of the paper's eq. 6 for each of the ``N`` nodes, ``(N,)`` of 0 or 1.
+    """The indicator ``C(t_i)`` of the paper's eq. 6 at the ``N`` nodes, ``(N,)`` of 0 or 1.
 
     A node violates if its state is off the table or inside a keep-out disc, or its control exceeds
     the actuation limit, by more than ``tolerance``.

@@ -55,7 +55,8 @@ class Robot:
                 raise ValueError(f"Robot.{name} must be a positive finite number, got {value!r}.")
         if self.lever_arm > self.radius:
             raise ValueError(
-                f"Robot.lever_arm must be at most the radius ({self.radius} m), got {self.lever_arm}."
+                f"Robot.lever_arm must be at most the radius ({self.radius} m), "
+                f"got {self.lever_arm}."
             )
 
     @property
@@ -101,7 +102,7 @@ class Robot:
 
     @cached_property
     def cluster_inverse(self) -> FloatArray:
-        """Pseudo-inverse of :attr:`cluster_matrix`, ``(4, 3)``, used by the OCP's actuation limit."""
+        """Pseudo-inverse of :attr:`cluster_matrix`, ``(4, 3)``, of the actuation limit."""
         q = 0.25 / self.lever_arm
         return np.array([[0, 0.5, q], [0.5, 0, -q], [0, 0.5, -q], [0.5, 0, q]])
 

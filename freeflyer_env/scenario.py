@@ -39,7 +39,8 @@ class Obstacles:
         radii = np.asarray(self.radii, dtype=np.float64).reshape(-1)
         if len(centres) != len(radii):
             raise ValueError(
-                f"Obstacles need one radius per centre, got {len(centres)} centres, {len(radii)} radii."
+                f"Obstacles need one radius per centre, got {len(centres)} centres "
+                f"and {len(radii)} radii."
             )
         if not (np.isfinite(centres).all() and np.isfinite(radii).all()):
             raise ValueError("Obstacles must be finite numbers; check centres and radii for NaN.")
@@ -181,7 +182,8 @@ class Problem:
             if (position < low - _ON_BOUNDARY).any() or (position > high + _ON_BOUNDARY).any():
                 lines.append(
                     f"the {name} ({position[0]:.3f}, {position[1]:.3f}) m is off the table: the "
-                    f"centre must stay in x [{low[0]:g}, {high[0]:g}], y [{low[1]:g}, {high[1]:g}] m"
+                    f"centre must stay in x [{low[0]:g}, {high[0]:g}], "
+                    f"y [{low[1]:g}, {high[1]:g}] m"
                 )
             gaps = np.linalg.norm(position - self.scenario.obstacles.centres, axis=1)
             for index, (gap, radius) in enumerate(zip(gaps, self.scenario.keep_out_radii)):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import difflib
 import enum
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
+import numpy as np
 from scipy import sparse
 
 from freeflyer_env.robot import FloatArray
@@ -54,6 +56,10 @@ class PIQPBackend:
         self._piqp = piqp
         self._solver = piqp.SparseSolver()
         self._solver.settings.max_iter = 100
+        # The subproblem is scaled by hand. Ruiz scaling would leave traces of earlier programs in
+        # the rounding of later ones: without it the same program has the same solution, bit for
+        # bit.
+        self._solver.settings.preconditioner_iter = 0
         self._is_set_up = False
 
     def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
@@ -70,10 +76,33 @@ class PIQPBackend:
             return SolverStatus.SOLVED, self._solver.result.x
         if status in (self._piqp.PIQP_PRIMAL_INFEASIBLE, self._piqp.PIQP_DUAL_INFEASIBLE):
             return SolverStatus.INFEASIBLE, self._solver.result.x
-        return SolverStatus.FAILED, self._solver.result.x
+        # Rare, and mostly a program that is infeasible by a hair: the simplex method decides.
+        return HiGHSBackend().solve(program)
 
 
-BACKENDS = {"piqp": PIQPBackend}
+class HiGHSBackend:
+    """HiGHS, the simplex method by way of SciPy: slower, and exact about infeasibility."""
+
+    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
+        from scipy.optimize import linprog
+
+        above, below = np.isfinite(program.h_upper), np.isfinite(program.h_lower)
+        result = linprog(
+            program.c,
+            A_ub=sparse.vstack([program.g[above], -program.g[below]]),
+            b_ub=np.concatenate([program.h_upper[above], -program.h_lower[below]]),
+            A_eq=program.a,
+            b_eq=program.b,
+            bounds=np.column_stack([program.x_lower, program.x_upper]),
+            method="highs-ds",
+        )
+        if result.status == 0:
+            return SolverStatus.SOLVED, result.x
+        failed = SolverStatus.INFEASIBLE if result.status == 2 else SolverStatus.FAILED
+        return failed, np.zeros_like(program.c)
+
+
+BACKENDS: dict[str, Callable[[], Backend]] = {"piqp": PIQPBackend, "highs": HiGHSBackend}
 
 
 def make_backend(name: str) -> Backend:

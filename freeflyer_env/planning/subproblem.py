@@ -34,7 +34,7 @@ from freeflyer_env.scenario import Problem
 
 #: Price of a metre of slack in multiples of the largest delta-V; above the keep-out multipliers
 #: seen.
-_SLACK_PRICE = 200.0
+_SLACK_PRICE = 5000.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,5 +93,5 @@ class Trajectory:
 
 
 def to_go(values: FloatArray) -> FloatArray:
-    """Sums from each index to the end: rewards to returns-to-go (paper, eq. 5), along the last axis."""
+    """Sums from each index to the end of the last axis: returns-to-go (paper, eq. 5)."""
     return np.cumsum(np.asarray(values)[..., ::-1], axis=-1)[..., ::-1]
