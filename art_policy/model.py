@@ -73,14 +73,13 @@ class ART(nn.Module):
             ValueError: If the files do not describe a model of this version.
         """
         folder = _find(name_or_path)
+        for name in (CONFIG_NAME, WEIGHTS_NAME):
+            if not (folder / name).is_file():
+                raise FileNotFoundError(f"{folder} holds no model: {name} is missing.")
         try:
             config = ARTConfig.from_dict(json.loads((folder / CONFIG_NAME).read_text("utf-8")))
             model = cls(config)
             model.load_state_dict(load_file(folder / WEIGHTS_NAME))
-        except FileNotFoundError as error:
-            raise FileNotFoundError(
-                f"{folder} holds no model: {Path(str(error.filename)).name} is missing."
-            ) from None
         except RuntimeError as error:
             raise ValueError(f"The weights in {folder} do not fit its config.json.") from error
         return model.to(device).eval()

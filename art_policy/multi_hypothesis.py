@@ -52,6 +52,9 @@ class HypothesisBatch:
     paths: Tensor
     costs: Tensor
 
+    def __len__(self) -> int:
+        return len(self.problems)
+
     def to(self, device: torch.device | str) -> HypothesisBatch:
         """The same on another device."""
         return HypothesisBatch(

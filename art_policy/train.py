@@ -13,9 +13,11 @@ import json
 import logging
 import math
 import os
+import signal
+import threading
 import time
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -120,14 +122,15 @@ class TrainConfig:
 
 @dataclass
 class _State:
-    """What a checkpoint holds."""
+    """A run: what a checkpoint holds, and one step of it."""
 
     model: ART
+    compute_loss: Callable[..., tuple[Tensor, dict[str, Tensor]]]
     average: list[Tensor]
     optimizer: torch.optim.Optimizer
+    settings: dict[str, Any]
     step: int = 0
     seconds: float = 0.0
-    settings: dict[str, Any] = field(default_factory=dict)
 
     @classmethod
     def create(cls, model_config: ARTConfig, config: TrainConfig) -> _State:
@@ -143,7 +146,8 @@ class _State:
         optimizer = torch.optim.AdamW(groups, lr=rate, betas=(0.9, 0.98), fused=True)
         average = [p.detach().clone() for p in model.parameters()]
         settings = {"model": model_config.to_dict(), "train": dataclasses.asdict(config)}
-        return cls(model, average, optimizer, settings=settings)
+        compute_loss = torch.compile(model.net.loss) if config.compile else model.net.loss
+        return cls(model, compute_loss, average, optimizer, settings)
 
     def save(self, path: Path) -> None:
         """Writes the checkpoint; a crash leaves the old one or the new one, never half of one."""
@@ -174,6 +178,25 @@ class _State:
         for mine, stored in zip(self.average, content["average"]):
             mine.copy_(stored)
         self.step, self.seconds = content["step"], content["seconds"]
+
+    def advance(self, batch: Any, config: TrainConfig) -> dict[str, float | Tensor]:
+        """One optimiser step; returns figures to log."""
+        began = time.perf_counter()
+        rate = config.rate(config.progress(self.step, self.seconds))
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        torch.manual_seed(_seed(config.seed, self.step))  # of dropout
+        self.model.train()
+        with _autocast(config):
+            loss, figures = self.compute_loss(batch)
+        loss.backward()
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.gradient_clip)
+        self.optimizer.step()
+        self.optimizer.zero_grad(set_to_none=True)
+        self.step += 1
+        self.update_average(config.ema_decay)
+        speed = len(batch) / (time.perf_counter() - began)
+        return {"lr": rate, "loss": loss, "norm": norm, "samples_per_s": speed, **figures}
 
     def update_average(self, decay: float) -> None:
         weight = 1.0 - min(decay, (1.0 + self.step) / (10.0 + self.step))
@@ -237,10 +260,7 @@ def train(
         logger.info("Resuming at step %d of %s.", state.step, checkpoint)
     log = _Log(out / LOG_NAME, state.step)
     logger.info("%d problems, %d parameters.", len(training), state.model.num_parameters)
-    try:
-        _loop(state, training, validation, config, log, checkpoint)
-    except KeyboardInterrupt:
-        logger.warning("Interrupted at step %d; saving.", state.step)
+    _loop(state, training, validation, config, log, checkpoint)
     state.save(checkpoint)
     model = state.averaged_model()
     if len(validation):
@@ -257,45 +277,26 @@ def _loop(
     log: _Log,
     checkpoint: Path,
 ) -> None:
-    """Optimiser steps until the schedule ends."""
+    """Optimiser steps until the schedule ends, or until Ctrl-C."""
     batches = _batches(training, state.step, config)
-    parameters = list(state.model.parameters())
-    compute_loss = torch.compile(state.model.net.loss) if config.compile else state.model.net.loss
-    start, first, saved = time.perf_counter() - state.seconds, state.step, time.perf_counter()
-    mark = time.perf_counter()
-    bar = tqdm(total=1000, unit="‰", desc="training", mininterval=5.0, leave=False)
-    state.model.train()
-    while (progress := config.progress(state.step, state.seconds)) < 1.0:
-        batch = next(batches)
-        rate = config.rate(progress)
-        for group in state.optimizer.param_groups:
-            group["lr"] = rate
-        torch.manual_seed(_seed(config.seed, state.step))  # dropout
-        with _autocast(config):
-            loss, figures = compute_loss(batch)
-        loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(parameters, config.gradient_clip)
-        state.optimizer.step()
-        state.optimizer.zero_grad(set_to_none=True)
-        state.step += 1
-        state.update_average(config.ema_decay)
-        state.seconds = time.perf_counter() - start
-        bar.update(int(1000 * progress) - bar.n)
-        if state.step % config.log_every == 0:
-            elapsed, mark = time.perf_counter() - mark, time.perf_counter()
-            steps = min(config.log_every, state.step - first)
-            log.write(
-                step=state.step, minutes=state.seconds / 60.0, lr=rate, loss=loss, norm=norm,
-                samples_per_s=steps * _batch_size(training, config) / elapsed, **figures,
-            )  # fmt: skip
-        if state.step % config.validate_every == 0 and len(validation):
-            log.write(step=state.step, **_validate(state.averaged_model(), validation, config))
-            mark = time.perf_counter()
-        if time.perf_counter() - saved > 60.0 * config.checkpoint_minutes:
-            state.save(checkpoint)
-            state.averaged_model().save_pretrained(checkpoint.parent)
-            saved = mark = time.perf_counter()
-    bar.close()
+    start = saved = time.perf_counter()
+    before = state.seconds
+    with _Interrupt() as interrupt, tqdm(total=100, unit="%", leave=False) as bar:
+        while (progress := config.progress(state.step, state.seconds)) < 1.0 and not interrupt.seen:
+            figures = state.advance(next(batches), config)
+            now = time.perf_counter()
+            state.seconds = before + now - start
+            bar.update(round(100.0 * progress - bar.n, 1))
+            if state.step % config.log_every == 0:
+                log.write(step=state.step, minutes=state.seconds / 60.0, **figures)
+            if state.step % config.validate_every == 0 and len(validation):
+                log.write(step=state.step, **_validate(state.averaged_model(), validation, config))
+            if now - saved > 60.0 * config.checkpoint_minutes:
+                state.save(checkpoint)
+                state.averaged_model().save_pretrained(checkpoint.parent)
+                saved = now
+    if interrupt.seen:
+        logger.warning("Interrupted at step %d; saving.", state.step)
 
 
 def _examples(dataset: PackedDataset, trajectories: np.ndarray, config: ARTConfig) -> ExampleSet:
@@ -351,6 +352,27 @@ def _autocast(config: TrainConfig) -> torch.autocast:
     if config.precision == "auto":
         enabled = kind == "cuda" or torch.cpu._is_avx512_bf16_supported()
     return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
+
+
+class _Interrupt:
+    """Turns Ctrl-C into a flag, so that no step is cut in half; a second one stops at once."""
+
+    def __init__(self) -> None:
+        self.seen = False
+        self._previous: Any = None
+
+    def __enter__(self) -> _Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            self._previous = signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self._previous is not None:
+            signal.signal(signal.SIGINT, self._previous)
+
+    def _handle(self, number: int, frame: object) -> None:
+        self.seen = True
+        signal.signal(signal.SIGINT, self._previous)
 
 
 class _Log:

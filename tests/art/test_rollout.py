@@ -1,0 +1,138 @@
+"""Proposals: whole trajectories of the right problem, cheap to get, good to refine."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from art_policy.layers import ARTConfig
+from art_policy.model import ART
+from art_policy.rollout import decode_poses, generate, propose, propose_batch
+from freeflyer_env import dynamics
+from freeflyer_env.constraints import actuation_excess, keep_out_depth
+from freeflyer_env.planning import solve_rel, solve_scp
+from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_problem
+
+MULTI = ARTConfig(width=32, n_layers=1, n_heads=2, n_hypotheses=4)
+SEQUENCE = replace(MULTI, head="autoregressive", context_length=8)
+
+
+@pytest.fixture(scope="module")
+def problems() -> list[Problem]:
+    """Problems of different lengths and numbers of obstacles."""
+    rng = np.random.default_rng(5)
+    return [
+        sample_problem(rng, final_time=final_time, n_obstacles=number)
+        for final_time, number in ((30.0, 4), (40.0, 2), (35.5, 0))
+    ]
+
+
+def model(config: ARTConfig) -> ART:
+    torch.manual_seed(1)
+    art = ART(config).eval()
+    with torch.no_grad():
+        for parameter in art.parameters():
+            parameter.add_(0.05 * torch.randn_like(parameter))
+    return art
+
+
+def test_multi_hypothesis_proposals(problems: list[Problem]) -> None:
+    art = model(MULTI)
+    for problem in problems:
+        proposals = propose(art, problem, n_candidates=10)
+        assert len(proposals) == 4
+        scores = [proposal.score for proposal in proposals]
+        assert scores == sorted(scores, reverse=True)
+        assert np.exp(scores).sum() == pytest.approx(1.0, abs=1e-5)
+        for proposal in proposals:
+            states = proposal.trajectory.states
+            assert states.shape == (problem.n_steps + 1, 6)
+            np.testing.assert_allclose(states[0], problem.start)
+            np.testing.assert_allclose(states[-1], problem.goal)
+            assert (keep_out_depth(problem.scenario, states[:, :2]) < 1e-9).all()
+            low, high = problem.scenario.position_limits
+            assert (states[:, :2] >= low - 1e-6).all()
+            assert (states[:, :2] <= high + 1e-6).all()
+
+
+def test_a_batch_gives_what_single_calls_give(problems: list[Problem]) -> None:
+    art = model(MULTI)
+    batch = propose_batch(art, problems, n_candidates=2)
+    assert propose_batch(art, []) == []
+    for problem, together in zip(problems, batch):
+        for one, other in zip(propose(art, problem, n_candidates=2), together):
+            assert one.score == pytest.approx(other.score, abs=1e-5)
+            np.testing.assert_allclose(one.trajectory.states, other.trajectory.states, atol=1e-5)
+
+
+def test_a_goal_to_the_left_is_planned_in_a_mirror(problems: list[Problem]) -> None:
+    problem, sign = problems[0], np.array([-1.0, 1.0, -1.0, -1.0, 1.0, -1.0])
+    scenario = problem.scenario
+    shift = np.array([scenario.table[0], 0, 0, 0, 0, 0])
+    rows = scenario.obstacles.rows()
+    rows[:, 0] = scenario.table[0] - rows[:, 0]
+    scene = Scenario(obstacles=Obstacles.from_rows(rows))
+    image = Problem(
+        scene, shift + sign * problem.start, shift + sign * problem.goal, problem.final_time
+    )
+    art = model(MULTI)
+    expected = shift + sign * propose(art, problem)[0].trajectory.states
+    np.testing.assert_allclose(propose(art, image)[0].trajectory.states, expected, atol=1e-5)
+
+
+def test_decoded_poses_follow_the_knots_where_nothing_is_in_the_way() -> None:
+    empty = Scenario(obstacles=Obstacles.from_rows([]))
+    start, goal = np.array([0.2, 1.0, 0.0, 0, 0, 0]), np.array([3.2, 1.0, 1.0, 0, 0, 0])
+    problem = Problem(empty, start, goal, 11.0)  # 22 nodes: 20 interior knots fall on nodes
+    knots = np.random.default_rng(0).normal(size=(2, 20, 3)) * 0.1
+    poses = decode_poses(problem, knots)
+    share = np.linspace(0.0, 1.0, 22)[1:-1, None]
+    line = (1.0 - share) * start[:3] + share * goal[:3]
+    np.testing.assert_allclose(poses[:, 1:-1], line + knots, atol=1e-6)
+
+
+def test_proposals_can_be_refined(problems: list[Problem]) -> None:
+    proposal = propose(model(MULTI), problems[1])[0]
+    assert solve_scp(problems[1], proposal.trajectory).solved
+
+
+@pytest.mark.parametrize("tokens_per_step", [2, 4])
+def test_generation_with_and_without_cache(problems: list[Problem], tokens_per_step: int) -> None:
+    net = model(replace(SEQUENCE, tokens_per_step=tokens_per_step)).net
+    returns = np.array([-0.3, -0.2, -0.4])
+    cached = generate(net, problems, returns)
+    plain = generate(net, problems, returns, use_cache=False)
+    for problem, a, b in zip(problems, cached, plain):
+        assert a.shape == (problem.n_steps, 3)
+        np.testing.assert_allclose(a, b, atol=1e-7)
+
+
+def test_sequence_proposals_obey_dynamics_and_actuation(problems: list[Problem]) -> None:
+    rels = [solve_rel(problem).trajectory for problem in problems]
+    groups = propose_batch(model(SEQUENCE), problems, n_candidates=3, rels=rels)
+    for problem, group in zip(problems, groups):
+        assert len(group) == 3
+        assert group[0].score >= group[1].score >= group[2].score
+        for proposal in group:
+            states, controls = proposal.trajectory.states, proposal.trajectory.controls
+            robot, dt = problem.scenario.robot, problem.scenario.dt
+            residual = dynamics.dynamics_residual(states, controls, dt, robot)
+            assert np.abs(residual).max() < 1e-12
+            excess = actuation_excess(problem.scenario, states[:-1, 2], controls)
+            assert excess.max() < 1e-9
+
+
+def test_the_reward_to_go_changes_what_is_generated(problems: list[Problem]) -> None:
+    net = model(SEQUENCE).net
+    low, high = generate(net, [problems[0]] * 2, np.array([-0.2, -0.6]))
+    assert np.abs(low - high).max() > 1e-6
+
+
+def test_bad_requests(problems: list[Problem]) -> None:
+    with pytest.raises(ValueError, match="n_candidates must be at least 1, got 0"):
+        propose(model(MULTI), problems[0], n_candidates=0)
+    with pytest.raises(ValueError, match="needs REL's trajectory"):
+        propose(model(SEQUENCE), problems[0])

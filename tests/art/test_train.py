@@ -1,0 +1,135 @@
+"""The training loop: it learns, repeats itself exactly, and goes on where it stopped."""
+
+from __future__ import annotations
+
+import json
+import signal
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from freeflyer_datasets.loading import PackedDataset
+
+from art_policy import train as train_module
+from art_policy.layers import ARTConfig
+from art_policy.train import CHECKPOINT_NAME, LOG_NAME, TrainConfig, train
+
+TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
+TINY_SEQUENCE = replace(TINY, head="autoregressive", context_length=12, tokens_per_step=2)
+HEADS = pytest.mark.parametrize("model", [TINY, TINY_SEQUENCE], ids=lambda config: config.head)
+
+SHORT = TrainConfig(max_steps=6, batch_size=8, log_every=2, validate_every=4, precision="float32")
+
+
+def log_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / LOG_NAME).read_text().splitlines()]
+
+
+@HEADS
+def test_same_seed_same_bytes(dataset: PackedDataset, tmp_path: Path, model: ARTConfig) -> None:
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        train(dataset, model, replace(SHORT, seed=seed), tmp_path / name)
+    a, b, c = ((tmp_path / name / "model.safetensors").read_bytes() for name in "abc")
+    assert a == b
+    assert a != c
+
+
+@HEADS
+def test_resuming_changes_nothing(
+    dataset: PackedDataset, tmp_path: Path, model: ARTConfig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    train(dataset, model, SHORT, tmp_path / "whole")
+    calls, update = 0, train_module._State.update_average
+
+    def interrupt(state: Any, decay: float) -> None:
+        nonlocal calls
+        calls += 1
+        update(state, decay)
+        if calls == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(train_module._State, "update_average", interrupt)
+    train(dataset, model, SHORT, tmp_path / "parts")
+    assert torch.load(tmp_path / "parts" / CHECKPOINT_NAME, weights_only=True)["step"] == 3
+    train(dataset, model, SHORT, tmp_path / "parts")
+    assert calls == SHORT.max_steps
+    whole, parts = (tmp_path / name / "model.safetensors" for name in ("whole", "parts"))
+    assert whole.read_bytes() == parts.read_bytes()
+    steps = [row["step"] for row in log_of(tmp_path / "parts") if "lr" in row]
+    assert steps == [2, 4, 6]
+
+
+def test_hypotheses_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) -> None:
+    model = replace(TINY, width=64, dropout=0.0)
+    config = replace(SHORT, max_steps=250, batch_size=24, learning_rate=3e-3, ema_decay=0.9,
+                     augment=False, log_every=50, validate_every=1000)  # fmt: skip
+    train(dataset, model, config, tmp_path)
+    rows = [row for row in log_of(tmp_path) if "lr" in row]
+    assert rows[-1]["distance"] < 0.03
+    assert rows[-1]["distance"] < 0.3 * rows[0]["distance"]
+    assert rows[-1]["agreement"] > 0.8
+
+
+def test_sequences_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) -> None:
+    model = replace(TINY_SEQUENCE, width=64, dropout=0.0, context_length=40)
+    config = replace(SHORT, max_steps=300, batch_size=8, learning_rate=3e-3, ema_decay=0.9,
+                     augment=False, log_every=50, validate_every=1000)  # fmt: skip
+    train(dataset, model, config, tmp_path)
+    rows = [row for row in log_of(tmp_path) if "lr" in row]
+    assert rows[-1]["control_loss"] < 0.4
+    assert rows[-1]["state_loss"] < 0.05
+
+
+def test_validation_problems_are_never_trained_on(dataset: PackedDataset) -> None:
+    training, validation = dataset.split(0.2)
+    ours = set(dataset.problem_index[training])
+    assert not ours & set(dataset.problem_index[validation])
+
+
+def test_the_clock_ends_the_schedule() -> None:
+    config = TrainConfig(max_minutes=2.0)
+    assert config.progress(10_000, 60.0) == 0.5
+    assert config.progress(0, 121.0) == 1.0
+    both = TrainConfig(max_minutes=2.0, max_steps=100)
+    assert both.progress(80, 60.0) == 0.8
+    rates = [config.rate(share) for share in (0.0, 0.03, 0.5, 1.0)]
+    assert rates[0] < 0.1 * rates[1]
+    assert rates[1] == pytest.approx(config.learning_rate)
+    assert rates[1] > rates[2] > rates[3]
+    assert rates[3] == pytest.approx(0.01 * config.learning_rate)
+
+
+def test_a_run_with_other_settings_is_not_resumed(dataset: PackedDataset, tmp_path: Path) -> None:
+    short = replace(SHORT, max_steps=1)
+    train(dataset, TINY, short, tmp_path)
+    with pytest.raises(ValueError, match="another learning_rate; train into another folder"):
+        train(dataset, TINY, replace(short, learning_rate=1e-4), tmp_path)
+    with pytest.raises(ValueError, match="another width"):
+        train(dataset, replace(TINY, width=64), short, tmp_path)
+    train(dataset, replace(TINY, width=64), short, tmp_path, resume=False)
+
+
+def test_autocast_stays_close_to_float32(dataset: PackedDataset, tmp_path: Path) -> None:
+    losses = []
+    for precision in ("float32", "bfloat16"):
+        folder = tmp_path / precision
+        train(dataset, TINY, replace(SHORT, precision=precision, max_steps=4), folder)
+        losses.append(next(row["loss"] for row in log_of(folder) if row["step"] == 4))
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"max_steps": None}, "needs max_steps or max_minutes"),
+        ({"max_steps": 0}, "max_steps must be positive, got 0"),
+        ({"learning_rate": -1.0}, "learning_rate must be positive, got -1.0"),
+        ({"ema_decay": 1.0}, r"ema_decay must be in \[0, 1\), got 1.0"),
+        ({"precision": "float16"}, "precision must be one of .* got 'float16'"),
+    ],
+)
+def test_bad_settings(changes: dict[str, Any], match: str) -> None:
+    with pytest.raises(ValueError, match=match):
+        replace(SHORT, **changes)
