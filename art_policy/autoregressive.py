@@ -1,14 +1,15 @@
 """The autoregressive head: the paper's model, a causal transformer over steps of a trajectory.
 
 Each step contributes the tokens ``x_i, P_i, S_i, u_i`` (paper, eq. 3): the state; the performance
-descriptors goal, reward-to-go, constraint-to-go and time-to-go; the scene descriptors; the control. The
-control is predicted from the last token before it, the next state from the control::
+descriptors goal, reward-to-go, constraint-to-go and time-to-go; the scene descriptors; the
+control. The control is predicted from the last token before it, the next state from the control::
 
     tokens_per_step = 4:   x_i  P_i  S_i -> u_i    u_i -> x_{i+1} (and the time-to-go)
     tokens_per_step = 2:   x_i + P_i + S_i -> u_i  u_i -> x_{i+1} (and the time-to-go)
 
-There is no table of positions: an embedding of the time-to-go is added to every token of a step, so that
-sub-sequences of any part of a trajectory can be told apart and sequences may be longer than the context.
+There is no table of positions: an embedding of the time-to-go is added to every token of a step,
+so that sub-sequences of any part of a trajectory can be told apart and sequences may be longer
+than the context.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ class Autoregressive(nn.Module):
         """Teacher forcing: predictions at every step.
 
         Returns:
-            Normalised controls ``(B, L, 3)`` and outcomes ``(B, L, 7)``: the normalised change of the
-            state, then the time-to-go in units of 40 s.
+            Normalised controls ``(B, L, 3)`` and outcomes ``(B, L, 7)``: the normalised change of
+            the state, then the time-to-go in units of 40 s.
         """
         size, length = batch.valid.shape
         described = self.embed_descriptors(

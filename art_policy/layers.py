@@ -30,11 +30,12 @@ class ARTConfig:
         n_hypotheses: Multi-hypothesis only: number of proposals.
         n_knots: Multi-hypothesis only: number of interior knots of a proposal.
         context_length: Autoregressive only: the paper's ``K``, in time steps.
-        tokens_per_step: Autoregressive only: 4 as in the paper (state, performance, scene, control),
-            or 2 (the three descriptors summed into one token, control).
+        tokens_per_step: Autoregressive only: 4 as in the paper (state, performance, scene,
+            control), or 2 (the three descriptors summed into one token, control).
         scene_descriptors: Autoregressive only: ``"relative"`` or ``"absolute"`` obstacles
             (paper, Sec. IV-C, question 3).
-        predict_time_to_go: Autoregressive only: adds the time-to-go to the loss (the paper's FT loss).
+        predict_time_to_go: Autoregressive only: adds the time-to-go to the loss (the paper's FT
+            loss).
     """
 
     head: str = "multi_hypothesis"
@@ -60,7 +61,8 @@ class ARTConfig:
                 raise ValueError(f"ARTConfig.{name} must be at least 1, got {getattr(self, name)}.")
         if self.width % self.n_heads:
             raise ValueError(
-                f"ARTConfig.width must be a multiple of n_heads, got {self.width} and {self.n_heads}."
+                "ARTConfig.width must be a multiple of n_heads, "
+                f"got {self.width} and {self.n_heads}."
             )
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"ARTConfig.dropout must be in [0, 1), got {self.dropout}.")
@@ -104,7 +106,7 @@ class ARTConfig:
 
 @dataclass
 class KeyValueCache:
-    """Keys and values of the tokens seen so far, each ``(B, heads, L, width / heads)``, by layer."""
+    """Keys and values of the past, each ``(B, heads, L, width / heads)``, by layer."""
 
     keys: list[Tensor] = dataclasses.field(default_factory=list)
     values: list[Tensor] = dataclasses.field(default_factory=list)

@@ -22,8 +22,8 @@ WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
 class ART(nn.Module):
     """The Autonomous Rendezvous Transformer: proposes trajectories for a problem.
 
-    Use :func:`art_policy.rollout.propose` to get trajectories; calling the module gives the raw outputs of
-    its head, ``MultiHypothesis`` or ``Autoregressive``.
+    Use :func:`art_policy.rollout.propose` to get trajectories; calling the module gives the raw
+    outputs of its head, ``MultiHypothesis`` or ``Autoregressive``.
 
     Attributes:
         config: Size and kind.
@@ -64,8 +64,8 @@ class ART(nn.Module):
         """A model ready for inference.
 
         Args:
-            name_or_path: A name that ships with the package (:func:`shipped_models`), a folder written by
-                :meth:`save_pretrained`, or a Hugging Face repository ``owner/name``.
+            name_or_path: A name that ships with the package (:func:`shipped_models`), a folder
+                written by :meth:`save_pretrained`, or a Hugging Face repository ``owner/name``.
             device: Where to put the weights.
 
         Raises:

@@ -1,13 +1,14 @@
 """The multi-hypothesis head: several whole trajectories and their scores in one forward pass.
 
-A problem becomes a short sequence: one token for start, goal and final time, one for each obstacle, and
-one learned query for each hypothesis. A bidirectional transformer mixes them; each query is then decoded
-into a score and a path, given as the deviation from uniform motion along the straight line::
+A problem becomes a short sequence: one token for start, goal and final time, one for each
+obstacle, and one learned query for each hypothesis. A bidirectional transformer mixes them; each
+query is then decoded into a score and a path, given as the deviation from uniform motion along the
+straight line::
 
-    q(s) = (1 - s) q_start + s q_goal + sum_k phi_k(s) d_k,      s = t / t_last,   q = (r_x, r_y, psi)
+    q(s) = (1 - s) q_start + s q_goal + sum_k phi_k(s) d_k,      s = t / t_last,  q = (x, y, psi)
 
-with hat functions ``phi_k`` at equally spaced knots, so that the ends are exact and any number of nodes
-can be read off. There is no order among obstacles, and no limit to their number.
+with hat functions ``phi_k`` at equally spaced knots, so that the ends are exact and any number of
+nodes can be read off. There is no order among obstacles, and no limit to their number.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ _ROBOT_RADIUS = 0.15  # m: half the width of the gap that lets the robot pass
 
 @lru_cache(maxsize=64)
 def interpolation_matrix(n_knots: int, n_nodes: int) -> Tensor:
-    """``(n_nodes, n_knots)`` values of the hat functions at equally spaced nodes; zero at the ends."""
+    """``(n_nodes, n_knots)`` values of the hat functions at equally spaced nodes."""
     position = torch.linspace(0.0, n_knots + 1.0, n_nodes)
     distance = (position[:, None] - torch.arange(1.0, n_knots + 1.0)).abs()
     return (1.0 - distance).clamp(min=0.0)
@@ -43,8 +44,8 @@ class HypothesisBatch:
 
     Attributes:
         problems: ``B`` problems.
-        paths: ``(B, R, S, 3)`` deviations ``(r_x, r_y, psi)`` of the optima from the straight line, at
-            ``S`` equally spaced times; m and rad.
+        paths: ``(B, R, S, 3)`` deviations ``(r_x, r_y, psi)`` of the optima from the straight
+            line, at ``S`` equally spaced times; m and rad.
         costs: ``(B, R)`` costs in m/s, infinite where a problem has fewer than ``R`` optima.
     """
 
@@ -114,7 +115,8 @@ class MultiHypothesis(nn.Module):
         """Proposals for each problem.
 
         Returns:
-            Deviations at the knots ``(B, H, n_knots, 3)`` in m, m, rad, and score logits ``(B, H)``.
+            Deviations at the knots ``(B, H, n_knots, 3)`` in m, m, rad, and score logits
+            ``(B, H)``.
         """
         batch, n_queries = len(problems), self.config.n_hypotheses
         tokens = torch.cat(
@@ -139,8 +141,8 @@ class MultiHypothesis(nn.Module):
 
         Returns:
             The loss, and figures to log: ``distance`` to the cheapest optimum of the nearest and
-            ``chosen_distance`` of the best-scored hypothesis in m, ``agreement`` of the two, and the
-            ``regret``, the relative excess cost of the optimum nearest to the best-scored one.
+            ``chosen_distance`` of the best-scored hypothesis in m, ``agreement`` of the two, and
+            the ``regret``, the relative excess cost of the optimum nearest to the best-scored one.
         """
         knots, scores = self(batch.problems)
         matrix = interpolation_matrix(self.config.n_knots, batch.paths.shape[2]).to(knots.device)
@@ -236,7 +238,7 @@ def problem_features(problems: ProblemBatch, table: tuple[float, float]) -> Tens
 
 
 def disc_features(problems: ProblemBatch, table: tuple[float, float]) -> Tensor:
-    """``(B, M, 12)`` scaled description of each disc, on the table and relative to start and goal."""
+    """``(B, M, 12)`` scaled description of each disc, on the table and relative to the way."""
     size = problems.start.new_tensor(table)
     centre, radius = problems.discs[..., :2], problems.discs[..., 2:]
     start, goal = problems.start[:, None, :2], problems.goal[:, None, :2]

@@ -82,7 +82,7 @@ def propose_batch(
 def _hypotheses(model: ART, problems: Sequence[Problem], n_candidates: int) -> list[list[Proposal]]:
     config = model.config
     batch = ProblemBatch.from_problems(problems)
-    # The models are trained on problems whose goal is to the right; others are looked at in a mirror.
+    # In training the goal is to the right; other problems are looked at in a mirror.
     to_left = batch.goal[:, 0] < batch.start[:, 0]
     mirrored = batch.mirrored(to_left, config.table[0], axis=0) if bool(to_left.any()) else batch
     knots, scores = model(mirrored.to(model.device))
@@ -150,14 +150,14 @@ def generate(
     *,
     use_cache: bool = True,
 ) -> list[FloatArray]:
-    """Model-based autoregressive generation (paper, Sec. III-C): the known dynamics give the states.
+    """Model-based autoregressive generation (paper, Sec. III-C): known dynamics give the states.
 
     Args:
         net: The network.
         problems: ``B`` problems; their final times may differ.
         returns_to_go: ``(B,)`` rewards-to-go at the start, minus the cost asked for, in m/s.
-        use_cache: Whether to keep keys and values of the past, or to run the whole sequence again at
-            every step (slow; the same result).
+        use_cache: Whether to keep keys and values of the past, or to run the whole sequence again
+            at every step (slow; the same result).
 
     Returns:
         Controls ``(N, 3)`` of each problem, within the actuation limit.

@@ -1,9 +1,9 @@
 """Problems and trajectories as tensors, and the exact symmetries that turn one example into many.
 
-Units stay SI here; the models scale what they read. Two symmetries of the optimal control problem are
-applied to whole batches (:meth:`ProblemBatch.mirrored`, :meth:`ProblemBatch.reversed`); the third,
-quarter turns of the body, is built into the models, which see headings only through
-``cos 4 psi, sin 4 psi`` and the turn from start to goal.
+Units stay SI here; the models scale what they read. Two symmetries of the optimal control problem
+are applied to whole batches (:meth:`ProblemBatch.mirrored`, :meth:`ProblemBatch.reversed`); the
+third, quarter turns of the body, is built into the models, which see headings only through
+``cos 4 psi``, ``sin 4 psi`` and the turn from start to goal.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class ProblemBatch:
         return self._mapped(which, self.start, self.goal, MIRROR_STATE[axis], size, axis)
 
     def reversed(self, which: Tensor, size: float) -> ProblemBatch:
-        """Reverses time and mirrors in x, which puts the start on the left again, where ``which``."""
+        """Reverses time and mirrors in x, so that the start stays on the left, where ``which``."""
         return self._mapped(which, self.goal, self.start, REVERSE_STATE, size, 0)
 
     def _mapped(
@@ -193,8 +193,8 @@ class SequenceBatch:
         return SequenceBatch(self.problems, *parts, self.valid[rows, index] & inside)
 
 
-#: Depth in m from which a node of a float32 rollout counts as inside a keep-out disc. Solutions touch
-#: the discs to rounding; nodes of relaxed trajectories are centimetres inside.
+#: Depth in m from which a node of a float32 rollout counts as inside a keep-out disc. Solutions
+#: touch the discs to rounding; nodes of relaxed trajectories are centimetres inside.
 KEEP_OUT_TOLERANCE = 1e-4
 
 
@@ -211,7 +211,7 @@ def keep_out_depth(discs: Tensor, positions: Tensor) -> Tensor:
 
 
 def reverse_controls(controls: Tensor, n_steps: Tensor) -> Tensor:
-    """Controls ``(B, L, 3)`` of the time-reversed and x-mirrored trajectories of ``n_steps`` each."""
+    """Controls ``(B, L, 3)`` of the trajectories reversed in time and mirrored in x."""
     index = n_steps[:, None] - 1 - torch.arange(controls.shape[1])
     rows = torch.arange(len(controls))[:, None]
     flipped = controls[rows, index.clamp(min=0)] * controls.new_tensor(REVERSE_CONTROL)

@@ -1,9 +1,9 @@
 """Training of both heads: one loop, seeded, and resumable from its last checkpoint.
 
-Everything random in step ``i`` is a function of ``(seed, i)`` alone: the order of the examples, their
-augmentation, dropout. A run that was cut off and resumed therefore gives the same weights as one that was
-not, as long as its schedule counts steps (``max_steps``); with ``max_minutes`` the learning rate follows
-the clock.
+Everything random in step ``i`` is a function of ``(seed, i)`` alone: the order of the examples,
+their augmentation, dropout. A run that was cut off and resumed therefore gives the same weights as
+one that was not, as long as its schedule counts steps (``max_steps``); with ``max_minutes`` the
+learning rate follows the clock.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ class TrainConfig:
 
     Attributes:
         max_steps: Number of optimiser steps, or None if only the clock counts.
-        max_minutes: Minutes of training, over all resumed runs, or None. Whichever comes first ends the
-            run, and the learning rate reaches its end there.
+        max_minutes: Minutes of training, over all resumed runs, or None. Whichever comes first
+            ends the run, and the learning rate reaches its end there.
         batch_size: Examples in a step (at most as many as there are).
         learning_rate: Peak rate of AdamW; linear warm-up, then cosine decay to a hundredth.
         weight_decay: Of matrices; vectors are not decayed.
@@ -61,8 +61,8 @@ class TrainConfig:
         log_every: Steps between lines of the log.
         validate_every: Steps between validations.
         checkpoint_minutes: Minutes between checkpoints.
-        precision: ``"bfloat16"`` for autocast, ``"float32"``, or ``"auto"``: bfloat16 where the processor
-            has instructions for it.
+        precision: ``"bfloat16"`` for autocast, ``"float32"``, or ``"auto"``: bfloat16 where the
+            processor has instructions for it.
         threads: Threads of PyTorch, or None to leave that alone.
         seed: Of everything random.
         device: Where to train.
@@ -239,7 +239,8 @@ def train(
         The model with averaged weights, in evaluation mode. After Ctrl-C too: everything is saved.
 
     Raises:
-        ValueError: If a checkpoint in ``out`` is of a different run, or there is nothing to train on.
+        ValueError: If a checkpoint in ``out`` is of a different run, or there is nothing to train
+            on.
     """
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
@@ -310,7 +311,7 @@ def _batch_size(training: ExampleSet, config: TrainConfig) -> int:
 
 
 def _batches(training: ExampleSet, step: int, config: TrainConfig) -> Iterator[Any]:
-    """Endless batches from ``step`` on; each epoch in its own order, a last partial batch dropped."""
+    """Endless batches from ``step`` on; every epoch in its own order, its last part dropped."""
     size = _batch_size(training, config)
     per_epoch = len(training) // size
     generator, epoch, order = torch.Generator(), -1, torch.empty(0)
