@@ -33,8 +33,9 @@ class ART(nn.Module):
     def __init__(self, config: ARTConfig) -> None:
         super().__init__()
         self.config = config
-        heads = {"multi_hypothesis": MultiHypothesis, "autoregressive": Autoregressive}
-        self.net: MultiHypothesis | Autoregressive = heads[config.head](config)
+        sequential = config.head == "autoregressive"
+        self.net: MultiHypothesis | Autoregressive
+        self.net = Autoregressive(config) if sequential else MultiHypothesis(config)
 
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """The head's forward pass."""

@@ -189,8 +189,9 @@ class SequenceBatch:
         inside = index < self.valid.shape[1]
         index = index.clamp(max=self.valid.shape[1] - 1)
         rows = torch.arange(len(self), device=first.device)[:, None]
-        parts = [getattr(self, item.name)[rows, index] for item in fields(self)[1:-1]]
-        return SequenceBatch(self.problems, *parts, self.valid[rows, index] & inside)
+        parts = {item.name: getattr(self, item.name)[rows, index] for item in fields(self)[1:]}
+        parts["valid"] = parts["valid"] & inside
+        return SequenceBatch(self.problems, **parts)
 
 
 #: Depth in m from which a node of a float32 rollout counts as inside a keep-out disc. Solutions

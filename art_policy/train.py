@@ -9,12 +9,9 @@ learning rate follows the clock.
 from __future__ import annotations
 
 import dataclasses
-import json
 import logging
 import math
 import os
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -29,6 +26,7 @@ from tqdm.auto import tqdm
 from art_policy.autoregressive import Autoregressive
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
+from art_policy.train_io import Interrupt, JsonLines
 from art_policy.training_data import HypothesisSet, SequenceSet
 
 if TYPE_CHECKING:
@@ -252,14 +250,14 @@ def train(
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
     state = _State.create(model_config, config)
-    if isinstance(state.model.net, Autoregressive):
+    if isinstance(state.model.net, Autoregressive) and isinstance(training, SequenceSet):
         sample = training.batch(torch.arange(min(len(training), 2048)), torch.Generator())
         state.model.net.fit_scales(sample)
     checkpoint = out / CHECKPOINT_NAME
     if resume and checkpoint.exists():
         state.load(checkpoint)
         logger.info("Resuming at step %d of %s.", state.step, checkpoint)
-    log = _Log(out / LOG_NAME, state.step)
+    log = JsonLines(out / LOG_NAME, state.step)
     logger.info("%d problems, %d parameters.", len(training), state.model.num_parameters)
     _loop(state, training, validation, config, log, checkpoint)
     state.save(checkpoint)
@@ -275,14 +273,14 @@ def _loop(
     training: ExampleSet,
     validation: ExampleSet,
     config: TrainConfig,
-    log: _Log,
+    log: JsonLines,
     checkpoint: Path,
 ) -> None:
     """Optimiser steps until the schedule ends, or until Ctrl-C."""
     batches = _batches(training, state.step, config)
     start = saved = time.perf_counter()
     before = state.seconds
-    with _Interrupt() as interrupt, tqdm(total=100, unit="%", leave=False) as bar:
+    with Interrupt() as interrupt, tqdm(total=100, unit="%", leave=False) as bar:
         while (progress := config.progress(state.step, state.seconds)) < 1.0 and not interrupt.seen:
             figures = state.advance(next(batches), config)
             now = time.perf_counter()
@@ -339,9 +337,9 @@ def _validate(model: ART, validation: ExampleSet, config: TrainConfig) -> dict[s
     count = min(len(validation), 4096)
     sums: dict[str, float] = {}
     for index in torch.arange(count).split(512):
-        batch = validation.batch(index, None)
+        batch: Any = validation.batch(index, None).to(config.device)
         with _autocast(config):
-            loss, figures = model.net.loss(batch.to(config.device))
+            loss, figures = model.net.loss(batch)
         for name, value in {"loss": loss, **figures}.items():
             sums[name] = sums.get(name, 0.0) + float(value) * len(index)
     return {f"val_{name}": value / count for name, value in sums.items()}
@@ -353,45 +351,3 @@ def _autocast(config: TrainConfig) -> torch.autocast:
     if config.precision == "auto":
         enabled = kind == "cuda" or torch.cpu._is_avx512_bf16_supported()
     return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
-
-
-class _Interrupt:
-    """Turns Ctrl-C into a flag, so that no step is cut in half; a second one stops at once."""
-
-    def __init__(self) -> None:
-        self.seen = False
-        self._previous: Any = None
-
-    def __enter__(self) -> _Interrupt:
-        if threading.current_thread() is threading.main_thread():
-            self._previous = signal.signal(signal.SIGINT, self._handle)
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._previous is not None:
-            signal.signal(signal.SIGINT, self._previous)
-
-    def _handle(self, number: int, frame: object) -> None:
-        self.seen = True
-        signal.signal(signal.SIGINT, self._previous)
-
-
-class _Log:
-    """JSON lines; of a resumed run, lines past the checkpoint are dropped first."""
-
-    def __init__(self, path: Path, step: int) -> None:
-        self._path = path
-        lines = path.read_text("utf-8").splitlines() if step and path.exists() else []
-        kept = [line for line in lines if json.loads(line)["step"] <= step]
-        path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
-
-    def write(self, **figures: Any) -> None:
-        row = {name: _plain(value) for name, value in figures.items()}
-        with self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
-        logger.info(" ".join(f"{name}={value:.4g}" for name, value in row.items()))
-
-
-def _plain(value: Any) -> float | int:
-    value = value.detach() if isinstance(value, Tensor) else value
-    return value if isinstance(value, int) else round(float(value), 6)
