@@ -31,7 +31,7 @@ def main() -> None:
         config = TrainConfig(max_steps=100, batch_size=64, learning_rate=2e-3, ema_decay=0.98)
         out = Path(folder, "model")
         model = train(dataset, ARTConfig(width=96, n_layers=3, n_heads=3), config, out)
-        *_, last = (json.loads(line) for line in Path(out, "log.jsonl").open())
+        last = json.loads((out / "log.jsonl").read_text().splitlines()[-1])
         print(f"{model.num_parameters} parameters, validation: {last}")
 
     rng = np.random.default_rng(1)
