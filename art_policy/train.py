@@ -162,7 +162,7 @@ class _State:
         os.replace(temporary, path)
 
     def load(self, path: Path) -> None:
-        content = torch.load(path, weights_only=True)
+        content = torch.load(path, map_location=self.model.device, weights_only=True)
         for kind in ("model", "train"):
             ours, theirs = self.settings[kind], content["settings"][kind]
             changed = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
@@ -188,7 +188,9 @@ class _State:
         with _autocast(config):
             loss, figures = self.compute_loss(batch)
         loss.backward()
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), config.gradient_clip)
+        norm = torch.nn.utils.clip_grad_norm_(
+            self.model.parameters(), config.gradient_clip, error_if_nonfinite=True
+        )
         self.optimizer.step()
         self.optimizer.zero_grad(set_to_none=True)
         self.step += 1
