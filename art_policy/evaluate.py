@@ -50,7 +50,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class ProblemRecord:
-    """All methods on one problem; ``c_rel`` counts REL's violating nodes, ``rel_cost`` is its bound."""
+    """All methods on one problem; ``c_rel`` counts REL's violating nodes."""
 
     scene: str
     index: int
@@ -60,7 +60,7 @@ class ProblemRecord:
     outcomes: dict[str, Outcome]
 
 
-def test_problems(
+def evaluation_problems(
     n_problems: int,
     scenes: str = "held-out",
     final_times: Sequence[float] = (40.0,),
@@ -130,7 +130,7 @@ def evaluate(
 
     Args:
         model: What :meth:`ART.from_pretrained` takes.
-        problems: As :func:`test_problems` gives them.
+        problems: As :func:`evaluation_problems` gives them.
         n_candidates: Largest number of candidates (and of starts of the multi-start baseline).
         workers: Processes; one per processor if None.
         progress: Whether to show a progress bar.
@@ -169,7 +169,7 @@ def _load_for_worker(model: str) -> ART:
 
     torch.set_num_threads(1)
     loaded = ART.from_pretrained(model)
-    scene, index, problem = test_problems(1, "nominal")[0]
+    scene, index, problem = evaluation_problems(1, "nominal")[0]
     evaluate_problem(loaded, scene, index, problem, 2)
     return loaded
 
@@ -214,7 +214,7 @@ def summarise(records: Sequence[ProblemRecord]) -> dict[str, dict[str, float]]:
 
 
 def report(records: Sequence[ProblemRecord], model: str) -> dict[str, Any]:
-    """Everything that ``freeflyer evaluate`` writes to JSON: figures for all problems and by group."""
+    """What ``freeflyer evaluate`` writes to JSON: figures for all problems and by group."""
     groups = {"all": list(records)}
     for scene in sorted({r.scene for r in records}):
         groups[f"scene {scene}"] = [r for r in records if r.scene == scene]

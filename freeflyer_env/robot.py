@@ -116,24 +116,12 @@ class Robot:
         Returns:
             ``(..., 4)`` signed delta-Vs in m/s.
         """
-        control = np.asarray(control, dtype=np.float64)
-        cos, sin = np.cos(psi), np.sin(psi)
-        body = np.stack(
-            [
-                cos * control[..., 0] + sin * control[..., 1],
-                -sin * control[..., 0] + cos * control[..., 1],
-                control[..., 2],
-            ],
-            axis=-1,
-        )
-        return body @ self.cluster_inverse.T
+        return body_from_world(psi, control) @ self.cluster_inverse.T
 
     def allocate(self, wrench_body: FloatArray) -> FloatArray:
         """Thruster duties that realise a body wrench as nearly as the thrusters can.
 
-        The four clusters have one internal degree of freedom; it is used to minimise the largest
-        duty, so every realisable wrench is met exactly. A wrench beyond reach is scaled down, its
-        direction kept.
+        Every realisable wrench is met exactly; one beyond reach is scaled down, its direction kept.
 
         Args:
             wrench_body: ``(..., 3)`` force and torque ``(F_x, F_y, M)`` in N, N, N m, body frame.
@@ -141,15 +129,39 @@ class Robot:
         Returns:
             ``(..., 8)`` duties in [0, 1].
         """
-        clusters = np.asarray(wrench_body, dtype=np.float64) @ self.cluster_inverse.T / self.thrust
-        null = np.array([1.0, 1.0, -1.0, -1.0])
-        signed = clusters * null
-        middle = 0.5 * (signed.max(axis=-1) + signed.min(axis=-1))
-        clusters = clusters - middle[..., None] * null
-        largest = np.abs(clusters).max(axis=-1, keepdims=True)
-        clusters = clusters / np.maximum(largest, 1.0)
+        clusters = self._balanced_clusters(wrench_body) / self.thrust
+        clusters = clusters / np.maximum(np.abs(clusters).max(axis=-1, keepdims=True), 1.0)
         duties = np.zeros((*clusters.shape[:-1], 8))
         for index, (forward, backward) in enumerate(CLUSTER_THRUSTERS):
             duties[..., forward] = np.maximum(clusters[..., index], 0.0)
             duties[..., backward] = np.maximum(-clusters[..., index], 0.0)
         return duties
+
+    def reach(self, control_body: FloatArray, dt: float) -> FloatArray:
+        """How much of their reach the thrusters need for an impulse, ``(...)``; 1 is all of it.
+
+        Args:
+            control_body: ``(..., 3)`` impulses per unit mass ``(dv_x, dv_y, h)``, body frame.
+            dt: Time in s in which to deliver them.
+        """
+        clusters = self._balanced_clusters(control_body)
+        return np.abs(clusters).max(axis=-1) / self.delta_v_max(dt)
+
+    def _balanced_clusters(self, target: FloatArray) -> FloatArray:
+        """Cluster thrusts ``(..., 4)`` for a wrench, with the smallest possible maximum.
+
+        The four clusters have one internal degree of freedom, ``(1, 1, -1, -1)``.
+        """
+        clusters = np.asarray(target, dtype=np.float64) @ self.cluster_inverse.T
+        null = np.array([1.0, 1.0, -1.0, -1.0])
+        signed = clusters * null
+        middle = 0.5 * (signed.max(axis=-1) + signed.min(axis=-1))
+        return clusters - middle[..., None] * null
+
+
+def body_from_world(psi: FloatArray | float, vector: FloatArray) -> FloatArray:
+    """Turns ``(..., 3)`` planar vectors with a moment from the global into the body frame."""
+    vector = np.asarray(vector, dtype=np.float64)
+    cos, sin = np.cos(psi), np.sin(psi)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([cos * x + sin * y, -sin * x + cos * y, vector[..., 2]], axis=-1)

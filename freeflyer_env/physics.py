@@ -1,0 +1,165 @@
+"""The pymunk world: walls, disc obstacles, the robot, contacts.
+
+Chipmunk advances positions with the velocities before it advances velocities with the forces. Half
+of a sub-step's velocity change is therefore applied before and half after it (velocity Verlet),
+which makes the motion under a constant world force exact at any number of sub-steps. A thruster's
+force turns with the body; over a sub-step it is applied at the heading of the sub-step's middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import pymunk
+
+from freeflyer_env.robot import FloatArray
+from freeflyer_env.scenario import Scenario
+
+_WALL_THICKNESS = 0.5  # m: thick enough that nothing tunnels through
+_ROBOT, _OBSTACLE, _WALL = 1, 2, 3
+
+
+@dataclass
+class ContactLog:
+    """Contacts of the robot since the log was last taken.
+
+    Attributes:
+        count: Number of contacts that began.
+        impulse: Sum of the magnitudes of all contact impulses in N s.
+        bodies: What was touched: obstacle indices, and ``"wall"``.
+    """
+
+    count: int = 0
+    impulse: float = 0.0
+    bodies: set[Any] = field(default_factory=set)
+
+    def to_info(self) -> dict[str, Any]:
+        """Plain values for an environment's ``info``."""
+        touched = sorted(self.bodies, key=str)
+        return {"count": self.count, "impulse": self.impulse, "with": touched}
+
+
+class World:
+    """One robot on one table.
+
+    Args:
+        scenario: Table, obstacles and robot; the physical discs collide, not their keep-out radii.
+        restitution: Of every contact, 0 (plastic) to 1 (elastic).
+        friction: Coulomb coefficient of every contact.
+    """
+
+    def __init__(self, scenario: Scenario, restitution: float = 0.5, friction: float = 0.0) -> None:
+        for name, value in (("restitution", restitution), ("friction", friction)):
+            if not 0.0 <= value <= 1.0:
+                raise ValueError(f"{name} must be in [0, 1], got {value}.")
+        self.scenario = scenario
+        # Chipmunk multiplies the two shapes' values; the robot's are one.
+        self._surface = (restitution, friction)
+        self.contacts = ContactLog()
+        self._space = pymunk.Space()
+        self._space.gravity = (0.0, 0.0)
+        # No overlap is tolerated, and what there is vanishes at once: distances are in metres here,
+        # where Chipmunk's defaults think in pixels.
+        self._space.collision_slop = 1e-4
+        robot = scenario.robot
+        self._body = pymunk.Body(robot.mass, robot.inertia)
+        self._shape = pymunk.Circle(self._body, robot.radius)
+        self._shape.elasticity, self._shape.friction = 1.0, 1.0
+        self._shape.collision_type = _ROBOT
+        self._space.add(self._body, self._shape)
+        self._add_obstacles()
+        self._add_walls()
+        self._space.on_collision(_ROBOT, _OBSTACLE, begin=self._began, post_solve=self._solved)
+        self._space.on_collision(_ROBOT, _WALL, begin=self._began, post_solve=self._solved)
+
+    @property
+    def state(self) -> FloatArray:
+        """State ``(6,)`` of the robot, a fresh array."""
+        body = self._body
+        return np.array([*body.position, body.angle, *body.velocity, body.angular_velocity])
+
+    @state.setter
+    def state(self, value: FloatArray) -> None:
+        x = [float(item) for item in value]
+        self._body.position, self._body.angle = (x[0], x[1]), x[2]
+        self._body.velocity, self._body.angular_velocity = (x[3], x[4]), x[5]
+        self._space.reindex_shapes_for_body(self._body)
+
+    def kick(self, velocity_change: FloatArray) -> None:
+        """Changes ``(v_x, v_y, omega)`` at once, as an impulse does."""
+        body, (dx, dy, turn) = self._body, (float(item) for item in velocity_change)
+        vx, vy = body.velocity
+        body.velocity = (vx + dx, vy + dy)
+        body.angular_velocity += turn
+
+    def advance(
+        self,
+        duration: float,
+        sub_steps: int,
+        wrench_body: Callable[[int], FloatArray] | None = None,
+    ) -> None:
+        """Advances the world.
+
+        Args:
+            duration: In s.
+            sub_steps: Number of equal physics steps.
+            wrench_body: Gives the wrench ``(F_x, F_y, M)`` in the body frame for each sub-step;
+                None lets the robot drift.
+        """
+        h, robot = duration / sub_steps, self.scenario.robot
+        for index in range(sub_steps):
+            if wrench_body is None:
+                self._space.step(h)
+                continue
+            fx, fy, torque = wrench_body(index)
+            alpha = torque / robot.inertia
+            body = self._body
+            middle = body.angle + 0.5 * h * (body.angular_velocity + 0.25 * h * alpha)
+            cos, sin = np.cos(middle), np.sin(middle)
+            force = np.array([cos * fx - sin * fy, sin * fx + cos * fy])
+            half = 0.5 * h * np.array([*(force / robot.mass), alpha])
+            self.kick(half)
+            self._space.step(h)
+            self.kick(half)
+
+    def take_contacts(self) -> ContactLog:
+        """The contacts since the last call."""
+        log, self.contacts = self.contacts, ContactLog()
+        return log
+
+    def _add_obstacles(self) -> None:
+        obstacles = self.scenario.obstacles
+        for index, (centre, radius) in enumerate(zip(obstacles.centres, obstacles.radii)):
+            shape = pymunk.Circle(self._space.static_body, float(radius), tuple(centre))
+            self._add_static(shape, _OBSTACLE, index)
+
+    def _add_walls(self) -> None:
+        width, height = self.scenario.table
+        t = _WALL_THICKNESS
+        left, right, low, high = -t, width + t, -t, height + t
+        corners = [(left, low), (right, low), (right, high), (left, high)]
+        for first, second in zip(corners, corners[1:] + corners[:1]):
+            segment = pymunk.Segment(self._space.static_body, first, second, t)
+            self._add_static(segment, _WALL, "wall")
+
+    def _add_static(self, shape: pymunk.Shape, kind: int, name: Any) -> None:
+        shape.elasticity, shape.friction = self._surface
+        shape.collision_type = kind
+        shape.freeflyer_name = name
+        self._space.add(shape)
+
+    def _began(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:
+        self.contacts.count += 1
+        self.contacts.bodies.add(_other(arbiter))
+
+    def _solved(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:
+        self.contacts.impulse += float(arbiter.total_impulse.length)
+        self.contacts.bodies.add(_other(arbiter))
+
+
+def _other(arbiter: pymunk.Arbiter) -> Any:
+    names = (getattr(shape, "freeflyer_name", None) for shape in arbiter.shapes)
+    return next(name for name in names if name is not None)
