@@ -108,6 +108,8 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
     * `sub_steps`: physics steps in a control step.
     * `max_obstacles`: rows of the `obstacles` observation; default: the scene's, at least 4.
     * `restitution`, `friction`: of all contacts.
+    * `contacts`: `False` lets the robot pass through obstacles and walls, as in the optimal control
+      problem's model; relaxed trajectories replay exactly then.
     * `render_mode`: `"rgb_array"`.
 
     ## Version History
@@ -129,6 +131,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
         max_obstacles: int | None = None,
         restitution: float = 0.5,
         friction: float = 0.0,
+        contacts: bool = True,
         render_mode: str | None = None,
     ) -> None:
         _require_choice("action_mode", action_mode, ACTION_MODES)
@@ -141,7 +144,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
         self.action_mode, self.render_mode, self.sub_steps = action_mode, render_mode, sub_steps
         self.final_time, self.success_reward = float(final_time), float(success_reward)
         self.terminate_early, self.goal_tolerance = terminate_early, tuple(goal_tolerance)
-        self.restitution, self.friction = restitution, friction
+        self.restitution, self.friction, self.contacts = restitution, friction, contacts
         self._fixed_scenario = _scenario(scenario)
         base = self._fixed_scenario or Scenario()
         n_obstacles = len(base.obstacles) if self._fixed_scenario else _MAX_OBSTACLES
@@ -197,7 +200,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
         """
         super().reset(seed=seed)
         self.problem = self._make_problem((options or {}).get("problem"))
-        self._world = World(self.scenario, self.restitution, self.friction)
+        self._world = self._make_world()
         self._world.state = self.problem.start
         self._modulator.reset()
         self._plan, self._duties = None, np.zeros(8)
@@ -257,7 +260,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
     def __setstate__(self, data: dict[str, Any]) -> None:
         self.__dict__.update(data)
         if self._world is not None:
-            state, self._world = self._world, World(self.scenario, self.restitution, self.friction)
+            state, self._world = self._world, self._make_world()
             self._world.state = state
 
     def _act(self, world: World, action: FloatArray) -> float:
@@ -335,6 +338,9 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
             "firing_time": self._firing_time.copy(),
             "contacts": world.take_contacts().to_info(),
         }
+
+    def _make_world(self) -> World:
+        return World(self.scenario, self.restitution, self.friction, solid=self.contacts)
 
     def _require_world(self) -> World:
         if self._world is None:

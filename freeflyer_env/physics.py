@@ -49,9 +49,16 @@ class World:
         scenario: Table, obstacles and robot; the physical discs collide, not their keep-out radii.
         restitution: Of every contact, 0 (plastic) to 1 (elastic).
         friction: Coulomb coefficient of every contact.
+        solid: Whether there are obstacles and walls to touch.
     """
 
-    def __init__(self, scenario: Scenario, restitution: float = 0.5, friction: float = 0.0) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        restitution: float = 0.5,
+        friction: float = 0.0,
+        solid: bool = True,
+    ) -> None:
         for name, value in (("restitution", restitution), ("friction", friction)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {value}.")
@@ -70,8 +77,9 @@ class World:
         self._shape.elasticity, self._shape.friction = 1.0, 1.0
         self._shape.collision_type = _ROBOT
         self._space.add(self._body, self._shape)
-        self._add_obstacles()
-        self._add_walls()
+        if solid:
+            self._add_obstacles()
+            self._add_walls()
         self._space.on_collision(_ROBOT, _OBSTACLE, begin=self._began, post_solve=self._solved)
         self._space.on_collision(_ROBOT, _WALL, begin=self._began, post_solve=self._solved)
 

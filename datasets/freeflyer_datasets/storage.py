@@ -88,6 +88,7 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
         )
         repeat = n_steps + 1
         time_to_go = shard.final_time[local] - scenario.dt * np.arange(repeat)[:, None]
+        # Every trajectory reaches the goal, so it ends as it does in the environment: terminated.
         last = np.arange(n_steps) == n_steps - 1
         success = shard.label[index] == LABEL_SCP or shard.c_rel[local] == 0
         attributes = {
@@ -103,8 +104,8 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
             },
             actions=controls,
             rewards=-np.abs(controls.astype(np.float64)).sum(axis=1),
-            terminations=last & success,
-            truncations=last & (not success),
+            terminations=last,
+            truncations=np.zeros(n_steps, dtype=bool),
             attributes={
                 **attributes,
                 "problem_index": shard.first + local,
