@@ -1,0 +1,411 @@
+"""The ``freeflyer`` command line.
+
+Bad input ends with one line on standard error and exit code 2; ``--json`` prints one JSON object
+for machines on standard output.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import logging
+import math
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+DEFAULT_MODEL = "art-scene-random"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point of the ``freeflyer`` script; returns the exit code."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
+    try:
+        options.run(options)
+    except KeyboardInterrupt:
+        print("interrupted; the same command resumes long work", file=sys.stderr)
+        return 130
+    except (ValueError, FileNotFoundError, IsADirectoryError, ModuleNotFoundError) as error:
+        message = " ".join(str(error).split())
+        print(f"freeflyer {options.command}: error: {message}", file=sys.stderr)
+        return 2
+    return 0
+
+
+# -- commands ------------------------------------------------------------------------------------
+
+
+def _plan(options: argparse.Namespace) -> None:
+    problem = _problem(options)
+    plan = _planner(options).plan(problem)
+    summary = {"problem": problem.to_dict(), **_plan_summary(plan)}
+    if options.out:
+        trajectory = plan.result.trajectory
+        _write(options.out, problem, plan, trajectory.states if trajectory is not None else None)
+        summary["out"] = str(options.out)
+    _print(options, summary, _plan_text(plan))
+
+
+def _fly(options: argparse.Namespace) -> None:
+    import gymnasium as gym
+
+    from freeflyer_env.control import fly
+
+    problem = _problem(options)
+    plan = _planner(options).plan(problem)
+    if plan.trajectory is None:
+        raise ValueError(f"there is no plan to fly: {plan.result.message}")
+    env = gym.make(
+        "freeflyer_env:FreeFlyer-v0",
+        action_mode="thrusters",
+        scenario=problem.scenario,
+        terminate_early=False,
+        render_mode="rgb_array" if options.out else None,
+    )
+    env.reset(options={"problem": problem})
+    base: Any = env.unwrapped
+    base.set_plan(plan.trajectory.states)
+    frames: list[Any] = []
+    if options.out:
+        _require_suffix(options.out, (".gif",))
+        frames.append(env.render())
+    drawn = [0]
+
+    def draw() -> None:
+        drawn[0] += 1
+        if options.out and drawn[0] % 4 == 0:
+            frames.append(env.render())
+
+    flight = fly(env, plan.trajectory, on_step=draw)
+    summary = {**_plan_summary(plan), "flight": flight_summary(flight)}
+    if options.out:
+        from freeflyer_env.rendering import save_gif
+
+        save_gif(frames, options.out, fps=10)
+        summary["out"] = str(options.out)
+    _print(options, summary, f"{_plan_text(plan)}\n{flight_text(flight)}")
+
+
+def _generate(options: argparse.Namespace) -> None:
+    from freeflyer_datasets import build, load_recipe
+
+    recipe = load_recipe(options.recipe)
+    if options.out:
+        os.environ["MINARI_DATASETS_PATH"] = str(Path(options.out).resolve())
+    dataset = build(
+        recipe,
+        n_problems=options.problems,
+        workers=options.workers,
+        progress=not options.json,
+        force=options.force,
+    )
+    where = f" in {options.out}" if options.out else ""
+    text = f"made {dataset}{where}; load it with minari.load_dataset({dataset!r})"
+    _print(options, {"dataset": dataset, "out": options.out}, text)
+
+
+def _train(options: argparse.Namespace) -> None:
+    from freeflyer_datasets import PackedDataset
+
+    from art_policy.layers import ARTConfig
+    from art_policy.train import TrainConfig, train
+
+    if Path(options.dataset).is_dir():
+        folder = Path(options.dataset)
+        is_packed = (folder / "meta.json").is_file()
+        dataset = PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
+    else:
+        dataset = PackedDataset.from_minari(options.dataset)
+    presets = {
+        "multi_hypothesis": ARTConfig,
+        "autoregressive": ARTConfig.paper,
+        "autoregressive_small": ARTConfig.small,
+    }
+    changes = json.loads(options.model_config or "{}")
+    training = {"seed": options.seed, **json.loads(options.train_config or "{}")}
+    config = TrainConfig(max_minutes=options.minutes, max_steps=options.steps, **training)
+    model = train(dataset, presets[options.head](**changes), config, options.out)
+    text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
+    _print(
+        options,
+        {"out": options.out, "parameters": model.num_parameters, "problems": dataset.n_problems},
+        f"{text} {options.out}",
+    )
+
+
+def _evaluate(options: argparse.Namespace) -> None:
+    from art_policy.evaluate import (
+        evaluate,
+        evaluation_problems,
+        markdown_table,
+        report,
+        save_report,
+    )
+    from art_policy.model import ART
+
+    ART.from_pretrained(options.model)  # a wrong name is an error before the work begins
+    problems = evaluation_problems(
+        options.problems, options.scenes, options.final_time, options.seed
+    )
+    records = evaluate(
+        options.model, problems, options.candidates, options.workers, progress=not options.json
+    )
+    data = report(records, options.model)
+    if options.out:
+        save_report(data, Path(options.out))
+    summary = {"model": options.model, "groups": data["groups"], "out": options.out}
+    text = "\n\n".join(
+        f"{name} ({group_size(group)} problems)\n\n{markdown_table(group)}"
+        for name, group in data["groups"].items()
+    )
+    _print(options, summary, text)
+
+
+def group_size(group: dict[str, dict[str, float]]) -> int:
+    """Number of problems of a group in a report."""
+    return int(next(iter(group.values()))["n"])
+
+
+def _render(options: argparse.Namespace) -> None:
+    import minari
+    from freeflyer_env.rendering import draw_scene, save_gif
+
+    from freeflyer_env import Problem
+
+    _require_suffix(options.out, (".gif", ".png"))
+    dataset = minari.load_dataset(options.dataset)
+    if not 0 <= options.episode < dataset.total_episodes:
+        raise ValueError(
+            f"--episode must be in [0, {dataset.total_episodes - 1}], got {options.episode}"
+        )
+    observations: Any = dataset[options.episode].observations
+    problem = Problem.from_dict({key: value[0] for key, value in observations.items()})
+    states = observations["state"]
+
+    def frame(index: int) -> Any:
+        return draw_scene(
+            problem.scenario,
+            states[index, :3],
+            goal=problem.goal[:3],
+            planned=states[:, :2],
+            flown=states[: index + 1, :2],
+            time=index * problem.scenario.dt,
+        )
+
+    if str(options.out).endswith(".png"):
+        from PIL import Image
+
+        Image.fromarray(frame(len(states) - 1)).save(options.out)
+    else:
+        save_gif([frame(i) for i in range(len(states))], options.out, fps=10)
+    _print(options, {"out": options.out}, f"wrote {options.out}")
+
+
+def _info(options: argparse.Namespace) -> None:
+    from art_policy.model import ART, shipped_models
+
+    if options.name is None:
+        from freeflyer_datasets import list_recipes
+
+        import freeflyer_env
+
+        data: dict[str, Any] = {
+            "version": freeflyer_env.__version__,
+            "models": shipped_models(),
+            "recipes": list_recipes(),
+            "scenes": list(freeflyer_env.SCENES),
+        }
+    else:
+        model = ART.from_pretrained(options.name)
+        data = {
+            "model": options.name,
+            "parameters": model.num_parameters,
+            "config": model.config.to_dict(),
+        }
+    _print(options, data, "\n".join(f"{key}: {value}" for key, value in data.items()))
+
+
+# -- input ---------------------------------------------------------------------------------------
+
+
+def _problem(options: argparse.Namespace) -> Any:
+    """The problem that the options describe; raises ``ValueError`` if it is invalid."""
+    import numpy as np
+
+    from freeflyer_env import Problem, Scenario, sample_problem, unwrap_goal
+
+    if options.problem:
+        data = json.loads(Path(options.problem).read_text(encoding="utf-8"))
+        return Problem.from_dict(data.get("problem", data)).require_valid()
+    scenario = None if options.scene == "random" else Scenario.named(options.scene)
+    rng = np.random.default_rng(options.seed)
+    problem = sample_problem(rng, scenario, options.final_time)
+    start, goal = problem.start, problem.goal
+    if options.start:
+        start = np.array([*options.start, 0.0, 0.0, 0.0])
+    if options.goal:
+        goal = np.array([*options.goal, 0.0, 0.0, 0.0])
+    if options.start or options.goal:
+        goal = unwrap_goal(start, goal)
+        problem = Problem(problem.scenario, start, goal, problem.final_time)
+    return problem.require_valid()
+
+
+def _planner(options: argparse.Namespace) -> Any:
+    from art_policy.model import ART
+    from art_policy.planner import PlannerConfig, WarmStartPlanner
+
+    model = None if options.model == "rel" else ART.from_pretrained(options.model)
+    return WarmStartPlanner(model, PlannerConfig(n_candidates=options.candidates))
+
+
+def _require_suffix(path: str, suffixes: tuple[str, ...]) -> None:
+    if Path(path).suffix not in suffixes:
+        raise ValueError(f"--out must end in {' or '.join(suffixes)}, got {path!r}")
+
+
+# -- output --------------------------------------------------------------------------------------
+
+
+def _plan_summary(plan: Any) -> dict[str, Any]:
+    return {
+        "status": plan.result.status.value,
+        "cost": plan.result.cost if plan.result.solved else None,
+        "iterations": plan.iterations,
+        "source": plan.source,
+        "timings_ms": {name: 1e3 * value for name, value in plan.timings.items()},
+        "monitor": list(plan.monitor),
+    }
+
+
+def _plan_text(plan: Any) -> str:
+    lines = [f"{plan.result.status.value}: {plan.result.message}"]
+    if plan.result.solved:
+        lines.append(
+            f"cost {plan.result.cost:.4f} m/s, warm start from {plan.source.upper()}, "
+            f"{plan.iterations} iterations, {1e3 * plan.timings['total']:.0f} ms"
+        )
+    return "\n".join([*lines, *(f"monitor: {line}" for line in plan.monitor)])
+
+
+def flight_summary(flight: Any) -> dict[str, Any]:
+    """Figures of a flight for JSON."""
+    return {
+        "success": flight.success,
+        "final_position_error_m": flight.final_error[0],
+        "final_heading_error_rad": flight.final_error[1],
+        "tracking_error_m": flight.tracking_error,
+        "firing_time_s": flight.firing_time,
+        "contacts": flight.contacts,
+    }
+
+
+def flight_text(flight: Any) -> str:
+    """One line about a flight."""
+    return (
+        f"flown under PID: {'success' if flight.success else 'goal missed'}, "
+        f"{1e3 * flight.final_error[0]:.1f} mm and {math.degrees(flight.final_error[1]):.2f} deg "
+        f"from the goal, tracking within {1e3 * flight.tracking_error:.1f} mm, "
+        f"{flight.firing_time:.1f} s of firing, {flight.contacts} contacts"
+    )
+
+
+def _write(out: str, problem: Any, plan: Any, states: Any) -> None:
+    """Writes a plan as JSON or, with planned and proposed path, as a picture."""
+    _require_suffix(out, (".json", ".png"))
+    if out.endswith(".json"):
+        controls = None if states is None else plan.result.trajectory.controls.tolist()
+        data = {"problem": problem.to_dict(), **_plan_summary(plan)}
+        data |= {"states": None if states is None else states.tolist(), "controls": controls}
+        Path(out).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
+        return
+    from freeflyer_env.rendering import draw_scene
+    from PIL import Image
+
+    picture = draw_scene(
+        problem.scenario,
+        problem.start[:3],
+        goal=problem.goal[:3],
+        planned=None if states is None else states[:, :2],
+    )
+    Image.fromarray(picture).save(out)
+
+
+def _print(options: argparse.Namespace, data: dict[str, Any], text: str) -> None:
+    print(json.dumps(data) if options.json else text)
+
+
+# -- options -------------------------------------------------------------------------------------
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="freeflyer", description="Learned warm starts for a free-flying spacecraft robot."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, run: Callable[[argparse.Namespace], None], text: str) -> Any:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(run=run)
+        sub.add_argument("--seed", type=int, default=0, help="seed of everything random")
+        sub.add_argument("--json", action="store_true", help="print one JSON object")
+        return sub
+
+    for name, run, text in (
+        ("plan", _plan, "Plan one problem: ART proposes, SCP refines."),
+        ("fly", _fly, "Plan one problem and fly the plan under PID with the thrusters."),
+    ):
+        sub = command(name, run, text)
+        sub.add_argument("--scene", default="random", help="'random' or a scene's name")
+        sub.add_argument("--final-time", type=float, default=40.0, help="in s")
+        sub.add_argument(
+            "--start", type=float, nargs=3, metavar=("X", "Y", "PSI"), help="m, m, rad"
+        )
+        sub.add_argument("--goal", type=float, nargs=3, metavar=("X", "Y", "PSI"), help="m, m, rad")
+        sub.add_argument("--problem", help="JSON file with start, goal, obstacles, final_time")
+        sub.add_argument("--model", default=DEFAULT_MODEL, help="model, or 'rel' for none")
+        sub.add_argument("--candidates", type=int, default=1, help="proposals that are refined")
+        sub.add_argument("--out", help="plan: .json or .png; fly: .gif")
+
+    sub = command("generate", _generate, "Make a Minari dataset from a recipe; resumes.")
+    sub.add_argument("recipe", help="a recipe's name or TOML file")
+    sub.add_argument("--problems", type=int, help="how many problems (default: the recipe's)")
+    sub.add_argument("--workers", type=int, help="processes (default: one per processor)")
+    sub.add_argument("--out", help="Minari data root (default: Minari's own)")
+    sub.add_argument("--force", action="store_true", help="replace a dataset of the same id")
+
+    sub = command("train", _train, "Train a model on a dataset; resumes.")
+    sub.add_argument("dataset", help="Minari id, or a folder of shards or of a packed dataset")
+    heads = ("multi_hypothesis", "autoregressive", "autoregressive_small")
+    sub.add_argument("--head", choices=heads, default=heads[0])
+    sub.add_argument("--minutes", type=float, help="length of the training")
+    sub.add_argument("--steps", type=int, help="length of the training in optimiser steps")
+    sub.add_argument("--out", required=True, help="folder of the model")
+    sub.add_argument("--model-config", help="JSON with fields of ARTConfig")
+    sub.add_argument("--train-config", help="JSON with fields of TrainConfig")
+
+    sub = command("evaluate", _evaluate, "Compare warm starts on problems never trained on.")
+    sub.add_argument("model", help="a shipped model's name, a folder, a Hugging Face id")
+    sub.add_argument("--problems", type=int, default=300)
+    sub.add_argument("--scenes", default="held-out", help="'held-out', 'random' or a scene's name")
+    sub.add_argument("--final-time", type=float, nargs="+", default=[40.0], help="in s")
+    sub.add_argument("--candidates", type=int, default=4, help="most candidates refined")
+    sub.add_argument("--workers", type=int)
+    sub.add_argument("--out", help="JSON file for the report")
+
+    sub = command("render", _render, "Draw an episode of a dataset.")
+    sub.add_argument("dataset", help="Minari id")
+    sub.add_argument("--episode", type=int, default=0)
+    sub.add_argument("--out", required=True, help=".gif or .png")
+
+    sub = command("info", _info, "What is installed, or a model's description.")
+    sub.add_argument("name", nargs="?", help="a model")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

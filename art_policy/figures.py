@@ -1,0 +1,73 @@
+"""Figures for papers and documentation, with Matplotlib."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from freeflyer_env.planning import solve_rel
+from freeflyer_env.scenario import Problem
+
+if TYPE_CHECKING:
+    from art_policy.planner import Plan
+    from freeflyer_env.control import Flight
+
+
+def plan_and_flight(problem: Problem, plan: Plan, flight: Flight, path: str | Path) -> None:
+    """Planned against flown path, and velocities (paper, Figs. 5 and 6).
+
+    Args:
+        problem: What was planned.
+        plan: A solved plan.
+        flight: The flight under a tracking controller.
+        path: Picture file to write.
+    """
+    from matplotlib.figure import Figure
+
+    trajectory = plan.result.trajectory
+    if trajectory is None:
+        raise ValueError("plan_and_flight needs a solved plan.")
+    figure = Figure(figsize=(11.0, 4.6), layout="constrained")
+    table, velocity = figure.subplots(1, 2, width_ratios=(1.25, 1.0))
+    _draw_table(table, problem)
+    rel = solve_rel(problem).trajectory
+    if rel is not None:
+        table.plot(*rel.states[:, :2].T, color="0.6", lw=1.2, ls=":", label="REL")
+    table.plot(*plan.warm_start.states[:, :2].T, color="tab:orange", lw=1.4, label="ART proposes")
+    table.plot(*trajectory.states[:, :2].T, "--", color="tab:blue", lw=2.2, label="SCP plans")
+    table.plot(*flight.states[:, :2].T, color="black", lw=1.2, label="PID flies")
+    table.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, frameon=False)
+    for axis, (name, color) in enumerate((("x", "tab:blue"), ("y", "tab:red"))):
+        planned = 100.0 * trajectory.states[:, 3 + axis]
+        velocity.step(
+            trajectory.times,
+            planned,
+            where="pre",
+            color=color,
+            ls="--",
+            label=f"$v_{name}$ planned",
+        )
+        flown = 100.0 * flight.states[:, 3 + axis]
+        velocity.plot(flight.times, flown, color=color, lw=1.0, label=f"$v_{name}$ flown")
+    velocity.set(xlabel="time in s", ylabel="velocity in cm/s")
+    velocity.grid(alpha=0.3)
+    velocity.legend(frameon=False)
+    figure.savefig(path, dpi=110)
+
+
+def _draw_table(axes: Any, problem: Problem) -> None:
+    from matplotlib.patches import Circle
+
+    scenario = problem.scenario
+    discs = zip(scenario.obstacles.centres, scenario.obstacles.radii, scenario.keep_out_radii)
+    for centre, radius, keep_out in discs:
+        axes.add_patch(Circle(centre, radius, color="0.35"))
+        axes.add_patch(Circle(centre, keep_out, fill=False, ec="tab:red", ls="--", lw=0.8))
+    for pose, color in ((problem.start, "black"), (problem.goal, "tab:green")):
+        axes.add_patch(Circle(pose[:2], scenario.robot.radius, fill=False, ec=color, lw=1.6))
+        nose = pose[:2] + scenario.robot.radius * np.array([np.cos(pose[2]), np.sin(pose[2])])
+        axes.plot(*zip(pose[:2], nose), color=color, lw=1.6)
+    axes.set(xlim=(0, scenario.table[0]), ylim=(0, scenario.table[1]), aspect="equal")
+    axes.set(xlabel="x in m", ylabel="y in m")
