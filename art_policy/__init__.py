@@ -1,4 +1,4 @@
-"""ART: transformers that propose warm starts for trajectory optimisation, and planners that use them."""
+"""ART: transformers that propose warm starts for trajectory optimisation, and their planners."""
 
 from __future__ import annotations
 

@@ -120,7 +120,7 @@ def _train(options: argparse.Namespace) -> None:
         dataset = PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
     else:
         dataset = PackedDataset.from_minari(options.dataset)
-    presets = {
+    presets: dict[str, Callable[..., ARTConfig]] = {
         "multi_hypothesis": ARTConfig,
         "autoregressive": ARTConfig.paper,
         "autoregressive_small": ARTConfig.small,

@@ -289,12 +289,12 @@ def sample_problem(
     if scenario is None:
         base = Scenario(obstacles=Obstacles.from_rows([]))
         obstacles = sample_obstacles(rng, n_obstacles, table=base.table)
-        rows = np.float32(obstacles.rows()).astype(np.float64)
+        rows = _float32_exact(obstacles.rows())
         scenario = replace(base, obstacles=Obstacles.from_rows(rows))
     radius, (width, _) = scenario.robot.radius, scenario.table
     start = _sample_state_at_rest(rng, scenario, (radius, 0.5 - radius))
     goal = _sample_state_at_rest(rng, scenario, (width - 0.5 + radius, width - radius))
-    goal = np.float32(unwrap_goal(start, goal)).astype(np.float64)
+    goal = _float32_exact(unwrap_goal(start, goal))
     return Problem(scenario, start, goal, final_time)
 
 
@@ -305,13 +305,17 @@ def _sample_state_at_rest(
     for _ in range(10_000):
         position = np.array([rng.uniform(*x_range), rng.uniform(low[1], high[1])])
         psi = rng.uniform(-np.pi, np.pi)
-        position = np.clip(np.float32(position).astype(np.float64), low, high)
-        gaps = np.linalg.norm(position - scenario.obstacles.centres, axis=1)
+        state = _float32_exact(np.array([*position, psi, 0.0, 0.0, 0.0]))
+        gaps = np.linalg.norm(state[:2] - scenario.obstacles.centres, axis=1)
         if (gaps > scenario.keep_out_radii).all():
-            return np.array([*position, np.float32(psi), 0.0, 0.0, 0.0], dtype=np.float64)
+            return state
     raise ValueError(
         f"The obstacles leave no free place with x in {x_range} m; use other obstacles."
     )
+
+
+def _float32_exact(values: FloatArray) -> FloatArray:
+    return values.astype(np.float32).astype(np.float64)
 
 
 # Rows (x, y, radius) in m.

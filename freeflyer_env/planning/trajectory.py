@@ -72,7 +72,7 @@ class Trajectory:
     @property
     def times(self) -> FloatArray:
         """``(N + 1,)`` times of the states in s; the last impulse acts at ``(N - 1) dt``."""
-        return self.dt * np.arange(self.n_steps + 1)
+        return self.dt * np.arange(self.n_steps + 1, dtype=np.float64)
 
     @property
     def cost(self) -> float:
