@@ -93,7 +93,7 @@ class HypothesisLoss:
     idle_weight: float = 0.02
     score_weight: float = 0.2
     cost_temperature: float = 0.02
-    length_scale: float = 0.05
+    length_scale: float = 0.3
 
 
 class MultiHypothesis(nn.Module):

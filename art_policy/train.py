@@ -282,12 +282,14 @@ def _loop(
     batches = _batches(training, state.step, config)
     start = saved = time.perf_counter()
     before = state.seconds
-    with Interrupt() as interrupt, tqdm(total=100, unit="%", leave=False) as bar:
+    layout = "{percentage:3.0f}% |{bar}| {elapsed}<{remaining}"
+    bar = tqdm(total=100, desc="training", leave=False, bar_format=layout)
+    with Interrupt() as interrupt, bar:
         while (progress := config.progress(state.step, state.seconds)) < 1.0 and not interrupt.seen:
             figures = state.advance(next(batches), config)
             now = time.perf_counter()
             state.seconds = before + now - start
-            bar.update(round(100.0 * progress - bar.n, 1))
+            bar.update(100.0 * progress - bar.n)
             if state.step % config.log_every == 0:
                 log.write(step=state.step, minutes=state.seconds / 60.0, **figures)
             if state.step % config.validate_every == 0 and len(validation):
