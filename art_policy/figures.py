@@ -63,10 +63,10 @@ def _draw_table(axes: Any, problem: Problem) -> None:
     scenario = problem.scenario
     discs = zip(scenario.obstacles.centres, scenario.obstacles.radii, scenario.keep_out_radii)
     for centre, radius, keep_out in discs:
-        axes.add_patch(Circle(centre, radius, color="0.35"))
-        axes.add_patch(Circle(centre, keep_out, fill=False, ec="tab:red", ls="--", lw=0.8))
+        axes.add_patch(Circle(tuple(centre), radius, color="0.35"))
+        axes.add_patch(Circle(tuple(centre), keep_out, fill=False, ec="tab:red", ls="--", lw=0.8))
     for pose, color in ((problem.start, "black"), (problem.goal, "tab:green")):
-        axes.add_patch(Circle(pose[:2], scenario.robot.radius, fill=False, ec=color, lw=1.6))
+        axes.add_patch(Circle(tuple(pose[:2]), scenario.robot.radius, fill=False, ec=color, lw=1.6))
         nose = pose[:2] + scenario.robot.radius * np.array([np.cos(pose[2]), np.sin(pose[2])])
         axes.plot(*zip(pose[:2], nose), color=color, lw=1.6)
     axes.set(xlim=(0, scenario.table[0]), ylim=(0, scenario.table[1]), aspect="equal")
