@@ -154,7 +154,7 @@ class Flight:
     contacts: int
     contact_impulse: float
     tracking_error: float
-    final_error: tuple[float, float, float, float]
+    final_error: tuple[float, ...]
     success: bool
 
 
@@ -182,8 +182,10 @@ def fly(
         )
     tracker = tracker or PIDTracker(base.robot)
     tracker.reset()
-    period, states, commands = base.control_dt, [base.state], []
-    contacts, impulse, worst, done, info = 0, 0.0, 0.0, False, {}
+    period, states = base.control_dt, [base.state]
+    commands: list[FloatArray] = []
+    info: dict[str, Any] = {}
+    contacts, impulse, worst, done = 0, 0.0, 0.0, False
     while not done:
         time = len(commands) * period
         duties = tracker.duties(states[-1], trajectory, time, period)

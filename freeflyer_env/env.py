@@ -8,18 +8,15 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
 from numpy.typing import NDArray
 
 from freeflyer_env.control import PulseWidthModulator
 from freeflyer_env.physics import World
 from freeflyer_env.robot import FloatArray, Robot, body_from_world
 from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_problem
+from freeflyer_env.spaces import MAX_FINAL_TIME, action_space, observation_space
 
 ACTION_MODES = ("delta_v", "thrusters", "on_off")
-
-#: Longest final time in s for which the observation's bounds hold.
-MAX_FINAL_TIME = 200.0
 
 #: One period of the pulse-width modulation in s (10 Hz), the control step of the thruster modes.
 PWM_PERIOD = 0.1
@@ -31,7 +28,7 @@ _REACH_TOLERANCE = 1e-3
 _MAX_OBSTACLES = 4
 
 
-class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
+class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     """
     ## Description
 
@@ -156,8 +153,8 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
                 )
             self.max_obstacles = max_obstacles
         self.control_dt = base.dt if action_mode == "delta_v" else PWM_PERIOD
-        self.action_space = _action_space(action_mode, base.robot, base.dt)
-        self.observation_space = _observation_space(base, self.max_obstacles)
+        self.action_space = action_space(action_mode, base.robot, base.dt)
+        self.observation_space = observation_space(base, self.max_obstacles)
         self._modulator = PulseWidthModulator(sub_steps)
         self._plan: FloatArray | None = None
         self._world: World | None = None
@@ -187,7 +184,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, NDArray[np.float32]], dict[str, Any]]:
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Starts an episode.
 
         Args:
@@ -211,7 +208,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
 
     def step(
         self, action: NDArray[Any]
-    ) -> tuple[dict[str, NDArray[np.float32]], float, bool, bool, dict[str, Any]]:
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Applies an action for one control step."""
         world = self._require_world()
         action = np.asarray(action)
@@ -230,7 +227,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
         reward = -effort + (self.success_reward if terminated else 0.0)
         return self._observation(), reward, terminated, at_end and not terminated, info
 
-    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+    def render(self) -> NDArray[np.uint8] | None:
         """The scene as ``(H, W, 3)`` uint8, with planned and flown path."""
         if self.render_mode is None:
             gym.logger.warn("render() needs render_mode: gym.make(..., render_mode='rgb_array').")
@@ -260,8 +257,8 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
     def __setstate__(self, data: dict[str, Any]) -> None:
         self.__dict__.update(data)
         if self._world is not None:
-            state, self._world = self._world, self._make_world()
-            self._world.state = state
+            self._world = self._make_world()
+            self._world.state = data["_world"]
 
     def _act(self, world: World, action: FloatArray) -> float:
         """Applies the action, advances the world, returns the effort in m/s."""
@@ -304,7 +301,7 @@ class FreeFlyerEnv(gym.Env[dict[str, NDArray[np.float32]], NDArray[Any]]):
             )
         return problem.require_valid()
 
-    def _observation(self) -> dict[str, NDArray[np.float32]]:
+    def _observation(self) -> dict[str, Any]:
         obstacles = np.zeros((self.max_obstacles, 3))
         rows = self.scenario.obstacles.rows()
         obstacles[: len(rows)] = rows
@@ -361,36 +358,3 @@ def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         near = difflib.get_close_matches(str(value), choices, n=1)
         hint = f" Did you mean {near[0]!r}?" if near else ""
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.{hint}")
-
-
-def _action_space(mode: str, robot: Robot, dt: float) -> spaces.Space[Any]:
-    if mode == "thrusters":
-        return spaces.Box(0.0, 1.0, (8,), np.float32)
-    if mode == "on_off":
-        return spaces.MultiBinary(8)
-    linear = np.sqrt(8.0) * robot.delta_v_max(dt)
-    limit = np.array([linear, linear, 4.0 * robot.lever_arm * robot.delta_v_max(dt)])
-    # One float32 step outwards, so that a plan at the limit is inside.
-    high = np.nextafter(limit.astype(np.float32), np.float32(np.inf))
-    return spaces.Box(-high, high, dtype=np.float32)
-
-
-def _observation_space(scenario: Scenario, max_obstacles: int) -> spaces.Dict:
-    """Bounds that no episode leaves: full thrust in one direction for the longest final time."""
-    robot, (width, height), t = scenario.robot, scenario.table, MAX_FINAL_TIME
-    speed = np.sqrt(8.0) * robot.thrust / robot.mass * t
-    rate = 4.0 * robot.lever_arm * robot.thrust / robot.inertia * t
-    turn = 3.0 * np.pi + 0.5 * rate * t
-    high = np.array([width, height, turn, speed, speed, rate], dtype=np.float32)
-    low = np.array([0.0, 0.0, -turn, -speed, -speed, -rate], dtype=np.float32)
-    rows = np.tile(
-        np.array([width, height, max(width, height)], dtype=np.float32), (max_obstacles, 1)
-    )
-    return spaces.Dict(
-        {
-            "state": spaces.Box(low, high, dtype=np.float32),
-            "goal": spaces.Box(low, high, dtype=np.float32),
-            "obstacles": spaces.Box(np.zeros_like(rows), rows, dtype=np.float32),
-            "time_to_go": spaces.Box(0.0, t, (1,), np.float32),
-        }
-    )

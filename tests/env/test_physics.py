@@ -1,0 +1,103 @@
+"""The pymunk world against closed forms."""
+
+import numpy as np
+import pytest
+
+from freeflyer_env import Obstacles, Robot, Scenario
+from freeflyer_env.physics import World
+
+EMPTY = Scenario(Obstacles.from_rows([]))
+ROBOT = Robot()
+
+
+@pytest.mark.parametrize("sub_steps", [1, 3, 10])
+def test_constant_force_without_rotation_is_exact(sub_steps):
+    world = World(EMPTY)
+    world.state = [1.0, 1.0, 0.0, 0.01, -0.02, 0.0]
+    for _ in range(6):
+        world.advance(0.5, sub_steps, lambda index: np.array([0.3, 0.1, 0.0]))
+    t, a = 3.0, np.array([0.3, 0.1]) / ROBOT.mass
+    expected = np.array([1.0, 1.0]) + t * np.array([0.01, -0.02]) + 0.5 * a * t**2
+    np.testing.assert_allclose(world.state[:2], expected, atol=1e-9)
+    np.testing.assert_allclose(world.state[3:5], [0.01 + a[0] * t, -0.02 + a[1] * t], atol=1e-9)
+
+
+@pytest.mark.parametrize("sub_steps", [1, 3, 10])
+def test_constant_torque_is_exact(sub_steps):
+    world = World(EMPTY)
+    world.state = [1.0, 1.0, 0.2, 0.0, 0.0, 0.1]
+    for _ in range(6):
+        world.advance(0.5, sub_steps, lambda index: np.array([0.0, 0.0, 0.01]))
+    alpha = 0.01 / ROBOT.inertia
+    assert world.state[2] == pytest.approx(0.2 + 0.3 + 0.5 * alpha * 9.0, abs=1e-9)
+    assert world.state[5] == pytest.approx(0.1 + 3.0 * alpha, abs=1e-9)
+
+
+def test_drift_conserves_momentum():
+    world = World(EMPTY)
+    world.state = [1.0, 1.0, 0.2, 0.03, 0.02, 0.4]
+    for _ in range(20):
+        world.advance(0.5, 10)
+    np.testing.assert_allclose(world.state[3:], [0.03, 0.02, 0.4], atol=1e-12)
+    np.testing.assert_allclose(world.state[:3], [1.3, 1.2, 4.2], atol=1e-9)
+
+
+def test_body_force_turns_with_the_body_and_converges():
+    """A forward force on a spinning robot: velocity Verlet is of second order."""
+
+    def final(sub_steps):
+        world = World(EMPTY)
+        world.state = [1.5, 1.2, 0.0, 0.0, 0.0, 0.5]
+        for _ in range(8):
+            world.advance(0.5, sub_steps, lambda index: np.array([0.3, 0.0, 0.0]))
+        return world.state
+
+    exact = np.array([np.sin(2.0), 1.0 - np.cos(2.0)]) * 0.3 / ROBOT.mass / 0.5
+    errors = [np.abs(final(n)[3:5] - exact).max() for n in (2, 4, 8)]
+    assert errors[2] < 2e-6
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
+
+
+@pytest.mark.parametrize("restitution", [0.0, 0.5, 1.0])
+def test_head_on_contact_with_a_disc(restitution):
+    world = World(Scenario(Obstacles.from_rows([[2.0, 1.25, 0.2]])), restitution=restitution)
+    world.state = [1.4, 1.25, 0.0, 0.1, 0.0, 0.0]
+    world.advance(8.0, 160)
+    np.testing.assert_allclose(world.state[3:], [-restitution * 0.1, 0.0, 0.0], atol=1e-6)
+    log = world.take_contacts().to_info()
+    assert log["with"] == [0]
+    assert log["count"] == 1
+    assert log["impulse"] == pytest.approx(ROBOT.mass * 0.1 * (1 + restitution), rel=1e-3)
+    assert world.take_contacts().to_info() == {"count": 0, "impulse": 0.0, "with": []}
+
+
+def test_grazing_contact_conserves_tangential_momentum():
+    world = World(EMPTY, restitution=0.5, friction=0.0)
+    world.state = [1.0, 0.3, 0.0, 0.05, -0.1, 0.2]
+    world.advance(4.0, 80)
+    assert world.state[3] == pytest.approx(0.05, abs=1e-9)
+    assert world.state[4] == pytest.approx(0.05, abs=1e-6)
+    assert world.state[5] == pytest.approx(0.2, abs=1e-9)
+    assert world.take_contacts().to_info()["with"] == ["wall"]
+
+
+def test_the_robot_stays_on_the_table():
+    world, rng = World(EMPTY, restitution=1.0), np.random.default_rng(0)
+    world.state = [1.0, 1.0, 0.0, *rng.uniform(-0.5, 0.5, 2), 0.0]
+    for _ in range(40):
+        world.advance(0.5, 10)
+        assert (world.state[:2] > ROBOT.radius - 5e-3).all()
+        assert (world.state[:2] < np.array(EMPTY.table) - ROBOT.radius + 5e-3).all()
+
+
+def test_without_contacts_it_passes_through():
+    world = World(Scenario(Obstacles.from_rows([[2.0, 1.25, 0.2]])), solid=False)
+    world.state = [1.4, 1.25, 0.0, 0.1, 0.0, 0.0]
+    world.advance(8.0, 20)
+    assert world.state[0] == pytest.approx(2.2, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", ["restitution", "friction"])
+def test_bad_surface(name):
+    with pytest.raises(ValueError, match=name):
+        World(EMPTY, **{name: 1.5})
