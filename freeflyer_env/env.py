@@ -62,12 +62,12 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
 
     `Dict`, all float32, SI units, global frame:
 
-    | Key          | Shape  | What                                                                   |
-    |--------------|--------|------------------------------------------------------------------------|
-    | `state`      | (6,)   | `(r_x, r_y, psi, v_x, v_y, omega)`; the heading is not wrapped         |
-    | `goal`       | (6,)   | the same of the goal                                                   |
-    | `obstacles`  | (M, 3) | `(x, y, radius)` of each disc; rows of zeros where there are fewer     |
-    | `time_to_go` | (1,)   | time left in s                                                         |
+    | Key          | Shape  | What                                                               |
+    |--------------|--------|--------------------------------------------------------------------|
+    | `state`      | (6,)   | `(r_x, r_y, psi, v_x, v_y, omega)`; the heading is not wrapped     |
+    | `goal`       | (6,)   | the same of the goal                                               |
+    | `obstacles`  | (M, 3) | `(x, y, radius)` of each disc; rows of zeros where there are fewer |
+    | `time_to_go` | (1,)   | time left in s                                                     |
 
     ## Rewards
 
@@ -149,7 +149,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         if max_obstacles is not None:
             if max_obstacles < n_obstacles and self._fixed_scenario:
                 raise ValueError(
-                    f"max_obstacles must be at least the scene's {n_obstacles}, got {max_obstacles}."
+                    f"max_obstacles must be at least the scene's {n_obstacles}, "
+                    f"got {max_obstacles}."
                 )
             self.max_obstacles = max_obstacles
         self.control_dt = base.dt if action_mode == "delta_v" else PWM_PERIOD
@@ -290,14 +291,16 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
                 self.np_random, self._fixed_scenario, self.final_time, n_obstacles=n_obstacles
             )
         problem = given if isinstance(given, Problem) else Problem.from_dict(given)
-        if len(problem.scenario.obstacles) > self.max_obstacles:
+        n_obstacles = len(problem.scenario.obstacles)
+        if n_obstacles > self.max_obstacles:
             raise ValueError(
-                f"The problem has {len(problem.scenario.obstacles)} obstacles, the environment room "
-                f"for {self.max_obstacles}: make it with max_obstacles={len(problem.scenario.obstacles)}."
+                f"The problem has {n_obstacles} obstacles, the environment room for "
+                f"{self.max_obstacles}: make it with max_obstacles={n_obstacles}."
             )
         if problem.final_time > MAX_FINAL_TIME:
             raise ValueError(
-                f"The final time must be at most {MAX_FINAL_TIME:g} s, got {problem.final_time:g} s."
+                f"The final time must be at most {MAX_FINAL_TIME:g} s, "
+                f"got {problem.final_time:g} s."
             )
         return problem.require_valid()
 

@@ -66,7 +66,7 @@ class Robot:
 
     @cached_property
     def control_gain(self) -> FloatArray:
-        """``(3,)`` gain from a control ``(dv_x, dv_y, h)`` to the change of ``(v_x, v_y, omega)``."""
+        """``(3,)`` gain from a control to the change of ``(v_x, v_y, omega)``."""
         return np.array([1.0, 1.0, self.mass_over_inertia])
 
     def delta_v_max(self, dt: float) -> float:
@@ -96,7 +96,7 @@ class Robot:
 
     @cached_property
     def cluster_matrix(self) -> FloatArray:
-        """``Lambda``: cluster delta-Vs ``(4,)`` to the body control ``(dv_x, dv_y, h)``, ``(3, 4)``."""
+        """``Lambda``: cluster delta-Vs to the body control ``(dv_x, dv_y, h)``, ``(3, 4)``."""
         b = self.lever_arm
         return np.array([[0, 1, 0, 1], [1, 0, 1, 0], [b, -b, -b, b]], dtype=np.float64)
 

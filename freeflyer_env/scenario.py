@@ -255,7 +255,7 @@ def sample_obstacles(
         ValueError: If so many discs do not fit.
     """
     rows: list[FloatArray] = []
-    for _ in range(1000 * max(n_obstacles, 1)):
+    for _ in range(10_000):
         if len(rows) == n_obstacles:
             break
         radius = rng.uniform(*radius_range)

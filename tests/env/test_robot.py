@@ -8,7 +8,16 @@ from freeflyer_env.robot import body_from_world
 
 ROBOT = Robot()
 # Sign of (F_x, F_y, M) of each thruster, from the drawing in freeflyer_env.robot.
-SIGNS = [(0, -1, -1), (-1, 0, 1), (1, 0, -1), (0, -1, 1), (0, 1, -1), (1, 0, 1), (-1, 0, -1), (0, 1, 1)]
+SIGNS = [
+    (0, -1, -1),
+    (-1, 0, 1),
+    (1, 0, -1),
+    (0, -1, 1),
+    (0, 1, -1),
+    (1, 0, 1),
+    (-1, 0, -1),
+    (0, 1, 1),
+]
 
 
 @pytest.mark.parametrize("thruster", range(8))

@@ -75,7 +75,10 @@ def test_unwrap_goal():
         (lambda: Scenario(keep_out_factor=0.9), "at least 1"),
         (lambda: Scenario.named("nominel"), "Did you mean 'nominal'"),
         (lambda: sample_obstacles(np.random.default_rng(0), 500), "ask for fewer"),
-        (lambda: Problem(EMPTY, START, [9, *GOAL[1:]]).require_valid(), "the goal .* is off the table"),
+        (
+            lambda: Problem(EMPTY, START, [9, *GOAL[1:]]).require_valid(),
+            "the goal .* is off the table",
+        ),
     ],
 )
 def test_bad_input(make, message):

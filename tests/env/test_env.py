@@ -1,0 +1,212 @@
+"""FreeFlyer-v0 as Gymnasium and its users see it."""
+
+import copy
+import pickle
+import warnings
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+from freeflyer_env import HELD_OUT_SCENES, Problem, dynamics, sample_problem
+from freeflyer_env.planning import solve_multistart
+
+MODES = ["delta_v", "thrusters", "on_off"]
+
+
+def make(**arguments):
+    return gym.make("freeflyer_env:FreeFlyer-v0", **arguments)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_gymnasiums_checker_has_nothing_to_say(mode):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(make(action_mode=mode, final_time=5.0).unwrapped)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_same_seed_same_bytes(mode):
+    def episode():
+        env = make(action_mode=mode)
+        env.action_space.seed(3)
+        observations = [env.reset(seed=5)[0]]
+        for _ in range(30):
+            observations.append(env.step(env.action_space.sample())[0])
+        return b"".join(o[key].tobytes() for o in observations for key in sorted(o))
+
+    assert episode() == episode()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_observations_are_in_the_space_fresh_and_float32(mode):
+    env = make(action_mode=mode)
+    first, _ = env.reset(seed=0)
+    kept = copy.deepcopy(first)
+    for _ in range(20):
+        observation, *_ = env.step(env.action_space.sample())
+        assert env.observation_space.contains(observation)
+        assert all(value.dtype == np.float32 for value in observation.values())
+    assert all(np.array_equal(first[key], kept[key]) for key in first)
+
+
+def test_delta_v_reproduces_the_impulsive_model():
+    env = make(terminate_early=False)
+    problem = sample_problem(np.random.default_rng(2))
+    env.reset(options={"problem": problem})
+    controls = np.float32(0.002 * np.random.default_rng(0).normal(size=(12, 3)) * [1, 1, 0.1])
+    states = [env.unwrapped.state]
+    for control in controls:
+        env.step(control)
+        states.append(env.unwrapped.state)
+    padded = np.vstack([controls.astype(np.float64), np.zeros((1, 3))])
+    expected = dynamics.rollout(problem.start, padded, 0.5, env.unwrapped.robot)
+    np.testing.assert_allclose(states, expected[:-1], atol=1e-9)
+
+
+def test_a_plan_flown_open_loop_ends_in_success():
+    problem = sample_problem(np.random.default_rng(3), HELD_OUT_SCENES[0])
+    plan = solve_multistart(problem, 4).best
+    env = make(terminate_early=False)
+    env.reset(options={"problem": problem})
+    rewards = []
+    for control in np.float32(plan.trajectory.controls):
+        observation, reward, terminated, truncated, info = env.step(control)
+        rewards.append(reward)
+    assert terminated
+    assert not truncated
+    assert info["is_success"]
+    assert info["contacts"]["count"] == 0
+    assert sum(rewards) == pytest.approx(1.0 - plan.cost, abs=1e-6)
+    assert info["cost"] == pytest.approx(plan.cost, abs=1e-6)
+    np.testing.assert_allclose(observation["state"], problem.goal, atol=1e-5)
+    assert observation["time_to_go"] == 0.0
+
+
+def test_without_success_the_episode_is_truncated_at_the_final_time():
+    for mode, steps in (("delta_v", 10), ("thrusters", 50)):
+        env = make(action_mode=mode, final_time=5.0)
+        env.reset(seed=1)
+        for step in range(steps):
+            _, _, terminated, truncated, info = env.step(np.zeros(env.action_space.shape))
+            assert truncated == (step == steps - 1)
+            assert not terminated
+        assert not info["is_success"]
+
+
+def test_impulses_beyond_reach_are_scaled_down():
+    env = make()
+    env.reset(options={"problem": sample_problem(np.random.default_rng(0), n_obstacles=0)})
+    base = env.unwrapped
+    limit = 2 * base.robot.delta_v_max(0.5)
+    heading = base.state[2]
+    forward = np.array([np.cos(heading), np.sin(heading), 0.0])
+    env.step(np.float32(1.0005 * limit * forward))
+    assert np.hypot(*base.state[3:5]) == pytest.approx(1.0005 * limit, rel=1e-5)
+    before = base.state[3:5]
+    env.step(np.float32(-1.2 * limit * forward))
+    assert np.hypot(*(base.state[3:5] - before)) == pytest.approx(limit, rel=1e-5)
+
+
+def test_thrusters_push_where_they_should():
+    env = make(action_mode="thrusters", scenario=[])
+    problem = Problem(env.unwrapped.scenario, [1.5, 1.2, 0, 0, 0, 0], [3.2, 1.2, 0, 0, 0, 0], 5.0)
+    env.reset(options={"problem": problem})
+    forward = np.zeros(8, dtype=np.float32)
+    forward[[2, 5]] = 1.0
+    for _ in range(10):
+        _, reward, _, _, info = env.step(forward)
+    state = env.unwrapped.state
+    np.testing.assert_allclose(state[3:], [0.4 / 16.0, 0, 0], atol=1e-12)
+    assert state[0] == pytest.approx(1.5 + 0.5 * 0.4 / 16.0, abs=1e-9)
+    np.testing.assert_allclose(info["firing_time"], forward * 1.0)
+    assert reward == pytest.approx(-0.4 * 0.1 / 16.0)
+
+
+def test_contacts_are_reported():
+    env = make(scenario=[[2.0, 1.2, 0.2]])
+    problem = Problem(
+        env.unwrapped.scenario, [1.6, 1.2, 0, 0.05, 0, 0], [3.2, 1.2, 0, 0, 0, 0], 5.0
+    )
+    env.reset(options={"problem": problem})
+    seen = [env.step(np.zeros(3, dtype=np.float32))[4]["contacts"] for _ in range(4)]
+    assert any(contact["with"] == [0] for contact in seen)
+
+
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("mode", MODES)
+def test_copies_go_on_identically(clone, mode):
+    env = make(action_mode=mode).unwrapped
+    env.reset(seed=4)
+    actions = [env.action_space.sample() for _ in range(10)]
+    for action in actions[:5]:
+        env.step(action)
+    twin = clone(env)
+    for action in actions[5:]:
+        first, second = env.step(action), twin.step(action)
+        np.testing.assert_array_equal(first[0]["state"], second[0]["state"])
+        assert first[1:4] == second[1:4]
+    np.testing.assert_array_equal(env.reset()[0]["goal"], twin.reset()[0]["goal"])
+
+
+def test_problems_can_be_given_as_mappings_or_observations():
+    problem = sample_problem(np.random.default_rng(7))
+    env = make()
+    first, _ = env.reset(options={"problem": problem.to_dict()})
+    again, _ = env.reset(options={"problem": first})
+    assert all(np.array_equal(first[key], again[key]) for key in first)
+    np.testing.assert_array_equal(env.unwrapped.problem.start, problem.start)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"action_mode": "thruster"}, "Did you mean 'thrusters'"),
+        ({"scenario": "nominl"}, "Did you mean 'nominal'"),
+        ({"final_time": 0.7}, "multiple of dt"),
+        ({"sub_steps": 0}, "sub_steps must be at least 1"),
+        ({"goal_tolerance": (0.1, 0.1, 0.1)}, "four positive numbers"),
+        ({"restitution": 2.0}, "restitution must be in"),
+        ({"scenario": "nominal", "max_obstacles": 2}, "at least the scene's 4"),
+    ],
+)
+def test_bad_arguments(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        make(**arguments).reset()
+
+
+def test_bad_problems_are_refused_in_one_line():
+    env = make()
+    inside = {"start": [1.0, 1.0, 0, 0, 0, 0], "goal": [3.2, 1, 0, 0, 0, 0], "final_time": 40.0}
+    with pytest.raises(ValueError, match="inside the keep-out zone of obstacle 0"):
+        env.reset(options={"problem": {**inside, "obstacles": [[1.1, 1.0, 0.1]]}})
+    with pytest.raises(ValueError, match="max_obstacles=5"):
+        env.reset(
+            options={
+                "problem": {**inside, "obstacles": [[2.0, 0.2 + i / 2, 0.05] for i in range(5)]}
+            }
+        )
+    with pytest.raises(ValueError, match="at most 200 s"):
+        env.reset(options={"problem": {**inside, "obstacles": [], "final_time": 300.0}})
+
+
+def test_bad_actions_and_calls():
+    env = make().unwrapped
+    with pytest.raises(gym.error.ResetNeeded, match="reset"):
+        env.step(np.zeros(3))
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="finite numbers"):
+        env.step(np.array([np.nan, 0, 0]))
+    with pytest.raises(ValueError, match=r"must be \(3,\)"):
+        env.step(np.zeros(8))
+
+
+def test_the_picture_changes_with_the_plan():
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    plain = env.render()
+    assert plain.dtype == np.uint8
+    assert plain.ndim == 3
+    env.unwrapped.set_plan(np.array([[0.5, 0.5, 0, 0, 0, 0], [3.0, 2.0, 0, 0, 0, 0]]))
+    assert (env.render() != plain).any()
