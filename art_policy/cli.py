@@ -109,10 +109,9 @@ def _generate(options: argparse.Namespace) -> None:
 
 
 def _train(options: argparse.Namespace) -> None:
-    from freeflyer_datasets import PackedDataset
-
     from art_policy.layers import ARTConfig
     from art_policy.train import TrainConfig, train
+    from freeflyer_datasets import PackedDataset
 
     if Path(options.dataset).is_dir():
         folder = Path(options.dataset)
@@ -172,9 +171,9 @@ def group_size(group: dict[str, dict[str, float]]) -> int:
 
 def _render(options: argparse.Namespace) -> None:
     import minari
-    from freeflyer_env.rendering import draw_scene, save_gif
 
     from freeflyer_env import Problem
+    from freeflyer_env.rendering import draw_scene, save_gif
 
     _require_suffix(options.out, (".gif", ".png"))
     dataset = minari.load_dataset(options.dataset)
@@ -209,9 +208,8 @@ def _info(options: argparse.Namespace) -> None:
     from art_policy.model import ART, shipped_models
 
     if options.name is None:
-        from freeflyer_datasets import list_recipes
-
         import freeflyer_env
+        from freeflyer_datasets import list_recipes
 
         data: dict[str, Any] = {
             "version": freeflyer_env.__version__,
@@ -323,8 +321,9 @@ def _write(out: str, problem: Any, plan: Any, states: Any) -> None:
         data |= {"states": None if states is None else states.tolist(), "controls": controls}
         Path(out).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
         return
-    from freeflyer_env.rendering import draw_scene
     from PIL import Image
+
+    from freeflyer_env.rendering import draw_scene
 
     picture = draw_scene(
         problem.scenario,

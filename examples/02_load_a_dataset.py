@@ -10,6 +10,7 @@ import tempfile
 
 import minari
 import numpy as np
+
 from freeflyer_datasets import LABEL_SCP, PackedDataset, Recipe, build
 
 

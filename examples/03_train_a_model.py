@@ -11,11 +11,11 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from freeflyer_datasets import PackedDataset, Recipe, generate
 
 from art_policy.layers import ARTConfig
 from art_policy.rollout import propose
 from art_policy.train import TrainConfig, train
+from freeflyer_datasets import PackedDataset, Recipe, generate
 from freeflyer_env import HELD_OUT_SCENES, sample_problem
 from freeflyer_env.planning import solve_rel, solve_scp
 

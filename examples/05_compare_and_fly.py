@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-from freeflyer_env.rendering import save_gif
 
 from art_policy import ART, WarmStartPlanner
 from art_policy.cli import DEFAULT_MODEL, flight_summary, flight_text
@@ -21,6 +20,7 @@ from art_policy.evaluate import evaluate, evaluation_problems, markdown_table, r
 from art_policy.figures import plan_and_flight
 from freeflyer_env.control import fly
 from freeflyer_env.planning import solve_rel
+from freeflyer_env.rendering import save_gif
 
 
 def most_telling(model: ART, problems: list[Any]) -> tuple[Any, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+
 from freeflyer_datasets import Recipe, generate
 from freeflyer_datasets.loading import PackedDataset
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from freeflyer_datasets.loading import PackedDataset
 
 from art_policy.layers import ARTConfig, KeyValueCache
 from art_policy.model import ART, CONFIG_NAME, WEIGHTS_NAME
 from art_policy.multi_hypothesis import HypothesisLoss, _assign, interpolation_matrix
 from art_policy.sequence import ProblemBatch, SequenceBatch
 from art_policy.training_data import HypothesisSet, SequenceSet, problem_batch
+from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4)
 TINY_SEQUENCE = replace(TINY, head="autoregressive", context_length=16)

@@ -8,8 +8,6 @@ from dataclasses import fields
 import numpy as np
 import pytest
 import torch
-from freeflyer_datasets.loading import PackedDataset
-from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 from torch import Tensor
 
 from art_policy.multi_hypothesis import disc_features, problem_features
@@ -22,6 +20,8 @@ from art_policy.sequence import (
     reverse_controls,
 )
 from art_policy.training_data import HypothesisSet, SequenceSet, deviations
+from freeflyer_datasets.loading import PackedDataset
+from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 from freeflyer_env import constraints
 from freeflyer_env.planning import Trajectory, to_go
 from freeflyer_env.scenario import Obstacles, Problem, Scenario

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 import torch
-from freeflyer_datasets.loading import PackedDataset
 
 from art_policy import train as train_module
 from art_policy.layers import ARTConfig
 from art_policy.train import CHECKPOINT_NAME, LOG_NAME, TrainConfig, train
+from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
 TINY_SEQUENCE = replace(TINY, head="autoregressive", context_length=12, tokens_per_step=2)

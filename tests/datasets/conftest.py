@@ -6,6 +6,7 @@ import importlib
 from pathlib import Path
 
 import pytest
+
 from freeflyer_datasets import Recipe, generate
 
 SHARD_SIZE = 4

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from freeflyer_datasets import LABEL_REL, LABEL_SCP, Recipe, generate
 from freeflyer_datasets.generate import solve_problems
 from freeflyer_datasets.shards import ShardError, iterate_shards, list_shards, read_shard
-
 from freeflyer_env.planning import Trajectory, solve_multistart
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from freeflyer_datasets import LABEL_SCP, PackedDataset, Recipe
 from freeflyer_datasets.shards import iterate_shards, list_shards
 

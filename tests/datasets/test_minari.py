@@ -9,6 +9,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+
 from freeflyer_datasets import LABEL_REL, PackedDataset, Recipe, build
 from freeflyer_datasets.export import Credits, environment_spec, export
 from freeflyer_datasets.packing import ARRAYS
@@ -20,7 +21,6 @@ from freeflyer_datasets.storage import (
     check_episode,
     shard_episodes,
 )
-
 from freeflyer_env import Problem
 
 minari = pytest.importorskip("minari")

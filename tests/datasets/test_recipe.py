@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from freeflyer_datasets import Recipe, list_recipes, load_recipe
 
+from freeflyer_datasets import Recipe, list_recipes, load_recipe
 from freeflyer_env import SCENES
 
 GOOD = {"id": "freeflyer/x-v0", "description": "A test.", "n_problems": 5, "seed": 1}
