@@ -102,7 +102,40 @@ class HiGHSBackend:
         return failed, np.zeros_like(program.c)
 
 
-BACKENDS: dict[str, Callable[[], Backend]] = {"piqp": PIQPBackend, "highs": HiGHSBackend}
+class OSQPBackend:
+    """OSQP, a first-order method: made for quadratic programs, slow and rough on these linear ones.
+
+    It is here for comparison. Its solutions hold to about 1e-4 of the largest delta-V.
+    """
+
+    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
+        import osqp
+
+        n = len(program.c)
+        solver = osqp.OSQP()
+        solver.setup(
+            sparse.csc_matrix((n, n)),
+            program.c,
+            sparse.vstack([program.a, program.g, sparse.identity(n)], format="csc"),
+            np.concatenate([program.b, program.h_lower, program.x_lower]),
+            np.concatenate([program.b, program.h_upper, program.x_upper]),
+            eps_abs=1e-5,
+            eps_rel=1e-5,
+            max_iter=50_000,
+            verbose=False,
+        )
+        result = solver.solve(raise_error=False)
+        if result.info.status == "solved":
+            return SolverStatus.SOLVED, np.asarray(result.x)
+        infeasible = "infeasible" in result.info.status
+        return SolverStatus.INFEASIBLE if infeasible else SolverStatus.FAILED, np.zeros(n)
+
+
+BACKENDS: dict[str, Callable[[], Backend]] = {
+    "piqp": PIQPBackend,
+    "highs": HiGHSBackend,
+    "osqp": OSQPBackend,
+}
 
 
 def make_backend(name: str) -> Backend:
