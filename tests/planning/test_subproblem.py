@@ -127,7 +127,7 @@ def test_backends_agree():
 def test_osqp_is_rough_but_not_wrong():
     for seed in range(3):
         problem = sample_problem(np.random.default_rng(seed), n_obstacles=0)
-        goal = problem.start + [0.3, 0.1, 0.4, 0.0, 0.0, 0.0]
+        goal = problem.start + np.array([0.3, 0.1, 0.4, 0.0, 0.0, 0.0])
         near = Problem(problem.scenario, problem.start, goal, 10.0)
         exact, rough = (
             subproblem_for(near, 0, backend=name).solve(near, straight_line(near), 10.0)
