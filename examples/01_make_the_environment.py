@@ -17,7 +17,7 @@ def main() -> None:
     forwards[[2, 5]] = 0.5
     done = False
     while not done:
-        observation, reward, terminated, truncated, info = env.step(forwards)
+        observation, _, terminated, truncated, info = env.step(forwards)
         done = terminated or truncated
         if info["contacts"]["count"]:
             left = observation["time_to_go"][0]
