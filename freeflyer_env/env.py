@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import difflib
+import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from numpy.typing import NDArray
 
 from freeflyer_env.control import PulseWidthModulator
 from freeflyer_env.physics import World
 from freeflyer_env.robot import FloatArray, Robot, body_from_world
 from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_problem
-from freeflyer_env.spaces import MAX_FINAL_TIME, action_space, observation_space
-
-ACTION_MODES = ("delta_v", "thrusters", "on_off")
+from freeflyer_env.spaces import (
+    ACTION_MODES,
+    action_space,
+    observation_space,
+    obstacle_rows,
+    require_fit,
+)
 
 #: One period of the pulse-width modulation in s (10 Hz), the control step of the thruster modes.
 PWM_PERIOD = 0.1
@@ -45,7 +52,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     ## Action Space
 
     `action_mode="delta_v"` (default): `Box(3)`, float32, the impulses of the optimal control
-    problem, one every 0.5 s, global frame. Beyond the thrusters' reach they are scaled down.
+    problem, one every 0.5 s, global frame. Beyond the thrusters' reach they are scaled down (what
+    is in reach depends on the heading; the bounds hold for the best one).
 
     | Num | Action                                   | Min       | Max      | Unit  |
     |-----|------------------------------------------|-----------|----------|-------|
@@ -54,7 +62,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     | 2   | angular impulse per unit mass, `J/m dw`  | -0.002866 | 0.002866 | m^2/s |
 
     `action_mode="thrusters"`: `Box(0, 1, (8,))`, float32, duty of each thruster over the next 0.1
-    s, realised by pulse-width modulation; on-times are whole sub-steps (10 ms).
+    s, realised by pulse-width modulation: one pulse, a whole number of sub-steps (10 ms) long. What
+    rounding leaves over is carried to the next step, so that small duties act on average.
 
     `action_mode="on_off"`: `MultiBinary(8)`, each thruster on or off for the next 0.1 s.
 
@@ -72,19 +81,21 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     ## Rewards
 
     `delta_v`: `-||u||_1` of the realised impulse, the negative of the paper's cost. Thruster modes:
-    minus the thrust impulse per unit mass of all eight thrusters in m/s. On success
-    `success_reward` is added.
+    minus the thrust impulse per unit mass of all eight thrusters in m/s, the propellant; this is
+    `||u||_1` for a push along a body axis, differs from it for other directions and turns, and
+    counts thrusters that work against each other. On success `success_reward` is added.
 
     ## Starting State
 
     At rest, uniform over the start region (x from 0.15 m to 0.35 m, any y, any heading); the goal
-    is in the opposite region. `reset(options={"problem": ...})` takes a `Problem`, or a mapping
-    with `start`, `goal`, `obstacles` and `final_time`.
+    is in the opposite region (x from 3.15 m to 3.35 m). `reset(options={"problem": ...})` takes a
+    `Problem`, or a mapping with `start`, `goal`, `obstacles` and `final_time`.
 
     ## Episode End
 
-    Terminated on success: within `goal_tolerance` of the goal in position, heading, speed and rate
-    (at the final time only, if `terminate_early=False`). Truncated at the final time.
+    Terminated on success: within `goal_tolerance` of the goal in position, heading (whole turns do
+    not matter), speed and rate; at the final time only, if `terminate_early=False`. Truncated at
+    the final time, or when the centre leaves the table, which only `contacts=False` makes possible.
 
     ## Info
 
@@ -95,9 +106,9 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     ## Arguments
 
     * `action_mode`: see above.
-    * `scenario`: `"random"` (new obstacles at every reset), the name of one of the paper's scenes,
-    rows
-      `(x, y, radius)`, or a `Scenario`.
+    * `scenario`: `"random"` (new obstacles at every reset), the name of one of the paper's scenes
+      (`freeflyer_env.SCENES`), rows `(x, y, radius)`, or a `Scenario`; all but the last can be
+      stored in an environment's spec.
     * `final_time`: in s.
     * `success_reward`: added to the reward on success.
     * `terminate_early`: whether success ends the episode before the final time.
@@ -107,7 +118,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     * `restitution`, `friction`: of all contacts.
     * `contacts`: `False` lets the robot pass through obstacles and walls, as in the optimal control
       problem's model; relaxed trajectories replay exactly then.
-    * `render_mode`: `"rgb_array"`.
+    * `render_mode`: `"rgb_array"`. Ten frames a second are real time in the thruster modes, and
+      five times as fast in `delta_v`.
 
     ## Version History
 
@@ -143,7 +155,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         self.terminate_early, self.goal_tolerance = terminate_early, tuple(goal_tolerance)
         self.restitution, self.friction, self.contacts = restitution, friction, contacts
         self._fixed_scenario = _scenario(scenario)
-        base = self._fixed_scenario or Scenario()
+        self._base = base = self._fixed_scenario or Scenario()
         n_obstacles = len(base.obstacles) if self._fixed_scenario else _MAX_OBSTACLES
         self.max_obstacles = max(n_obstacles, _MAX_OBSTACLES)
         if max_obstacles is not None:
@@ -155,13 +167,15 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             self.max_obstacles = max_obstacles
         self.control_dt = base.dt if action_mode == "delta_v" else PWM_PERIOD
         self.action_space = action_space(action_mode, base.robot, base.dt)
-        self.observation_space = observation_space(base, self.max_obstacles)
+        self.observation_space: spaces.Dict = observation_space(base, self.max_obstacles)
         self._modulator = PulseWidthModulator(sub_steps)
         self._plan: FloatArray | None = None
         self._world: World | None = None
-        # A problem to show before the first reset, and an early error for a final time that is
-        # wrong.
+        self._step_count = 0
+        # A problem to show before the first reset, and an early error for arguments that are wrong.
         self.problem = sample_problem(np.random.default_rng(0), base, self.final_time)
+        require_fit(self.problem, base, self.observation_space)
+        self._make_world()
 
     @property
     def scenario(self) -> Scenario:
@@ -197,15 +211,23 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             ValueError: If the problem is invalid; the message says why in one line.
         """
         super().reset(seed=seed)
-        self.problem = self._make_problem((options or {}).get("problem"))
+        options = options or {}
+        if unknown := sorted(set(options) - {"problem"}):
+            raise ValueError(f"reset() knows only the option 'problem', got {unknown}.")
+        self.problem = self._make_problem(options.get("problem"))
+        self._constants = {
+            "goal": np.float32(self.problem.goal),
+            "obstacles": obstacle_rows(self.problem, self.max_obstacles),
+        }
         self._world = self._make_world()
         self._world.state = self.problem.start
         self._modulator.reset()
         self._plan, self._duties = None, np.zeros(8)
         self._step_count, self._cost, self._firing_time = 0, 0.0, np.zeros(8)
-        self._n_steps = round(self.problem.final_time / self.control_dt)
+        self._n_steps = math.ceil(self.problem.final_time / self.control_dt - 1e-6)
         self._flown = [self.problem.start[:2]]
-        return self._observation(), self._info()
+        state = self._world.state
+        return self._observation(state), self._info(state)
 
     def step(
         self, action: NDArray[Any]
@@ -221,12 +243,14 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         effort = self._act(world, action.astype(np.float64))
         self._cost += effort
         self._step_count += 1
-        self._flown.append(world.state[:2])
-        info = self._info()
+        state = world.state
+        self._flown.append(state[:2])
+        info = self._info(state)
         at_end = self._step_count >= self._n_steps
         terminated = bool(info["is_success"] and (at_end or self.terminate_early))
+        truncated = not terminated and (at_end or self._off_table(state))
         reward = -effort + (self.success_reward if terminated else 0.0)
-        return self._observation(), reward, terminated, at_end and not terminated, info
+        return self._observation(state), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
         """The scene as ``(H, W, 3)`` uint8, with planned and flown path."""
@@ -238,6 +262,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         return draw_scene(
             self.scenario,
             self.state[:3],
+            start=self.problem.start[:3],
             goal=self.problem.goal[:3],
             duties=self._duties,
             planned=self._plan,
@@ -279,7 +304,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         else:
             pulses = np.broadcast_to(action > 0.5, (self.sub_steps, 8))
         wrenches = pulses @ robot.wrench_matrix.T
-        world.advance(period, self.sub_steps, wrenches.__getitem__)
+        world.advance(period, self.sub_steps, wrenches)
         self._duties = pulses.mean(axis=0)
         self._firing_time += self._duties * period
         return float(robot.thrust / robot.mass * self._duties.sum() * period)
@@ -290,53 +315,42 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             return sample_problem(
                 self.np_random, self._fixed_scenario, self.final_time, n_obstacles=n_obstacles
             )
-        problem = given if isinstance(given, Problem) else Problem.from_dict(given)
-        n_obstacles = len(problem.scenario.obstacles)
-        if n_obstacles > self.max_obstacles:
+        if not isinstance(given, (Problem, Mapping)):
             raise ValueError(
-                f"The problem has {n_obstacles} obstacles, the environment room for "
-                f"{self.max_obstacles}: make it with max_obstacles={n_obstacles}."
+                f"A problem must be a Problem or a mapping, got {type(given).__name__}."
             )
-        if problem.final_time > MAX_FINAL_TIME:
-            raise ValueError(
-                f"The final time must be at most {MAX_FINAL_TIME:g} s, "
-                f"got {problem.final_time:g} s."
-            )
-        return problem.require_valid()
+        problem = given if isinstance(given, Problem) else Problem.from_dict(given, self._base)
+        require_fit(problem.require_valid(), self._base, self.observation_space)
+        return problem
 
-    def _observation(self) -> dict[str, Any]:
-        obstacles = np.zeros((self.max_obstacles, 3))
-        rows = self.scenario.obstacles.rows()
-        obstacles[: len(rows)] = rows
+    def _observation(self, state: FloatArray) -> dict[str, Any]:
+        box: Any = self.observation_space["state"]
         time_to_go = max(self.problem.final_time - self.time, 0.0)
-        values = {
-            "state": self._require_world().state,
-            "goal": self.problem.goal,
-            "obstacles": obstacles,
-            "time_to_go": np.array([time_to_go]),
-        }
-        box: Any = self.observation_space
         return {
-            key: np.clip(np.float32(value), box[key].low, box[key].high)
-            for key, value in values.items()
+            "state": np.minimum(np.maximum(np.float32(state), box.low), box.high),
+            **{key: value.copy() for key, value in self._constants.items()},
+            "time_to_go": np.array([time_to_go], dtype=np.float32),
         }
 
-    def _info(self) -> dict[str, Any]:
-        world = self._require_world()
-        state, goal = world.state, self.problem.goal
-        turn = (state[2] - goal[2] + np.pi) % (2 * np.pi) - np.pi
+    def _off_table(self, state: FloatArray) -> bool:
+        """Whether the centre has left the table, as it can where there are no contacts."""
+        (x, y), (width, height) = state[:2].tolist(), self._base.table
+        return not self.contacts and not (0.0 <= x <= width and 0.0 <= y <= height)
+
+    def _info(self, state: FloatArray) -> dict[str, Any]:
+        x, y, psi, v_x, v_y, omega = (state - self.problem.goal).tolist()
         error = (
-            float(np.hypot(*(state[:2] - goal[:2]))),
-            float(abs(turn)),
-            float(np.hypot(*(state[3:5] - goal[3:5]))),
-            float(abs(state[5] - goal[5])),
+            math.hypot(x, y),
+            abs((psi + math.pi) % (2.0 * math.pi) - math.pi),
+            math.hypot(v_x, v_y),
+            abs(omega),
         )
         return {
             "is_success": all(e <= t for e, t in zip(error, self.goal_tolerance)),
             "goal_error": error,
             "cost": self._cost,
             "firing_time": self._firing_time.copy(),
-            "contacts": world.take_contacts().to_info(),
+            "contacts": self._require_world().take_contacts().to_info(),
         }
 
     def _make_world(self) -> World:

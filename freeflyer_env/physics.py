@@ -8,7 +8,7 @@ force turns with the body; over a sub-step it is applied at the heading of the s
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -19,7 +19,7 @@ from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Scenario
 
 _WALL_THICKNESS = 0.5  # m: thick enough that nothing tunnels through
-_ROBOT, _OBSTACLE, _WALL = 1, 2, 3
+_ROBOT, _WALL, _FIRST_OBSTACLE = 1, 2, 3
 
 
 @dataclass
@@ -34,7 +34,7 @@ class ContactLog:
 
     count: int = 0
     impulse: float = 0.0
-    bodies: set[Any] = field(default_factory=set)
+    bodies: set[int | str] = field(default_factory=set)
 
     def to_info(self) -> dict[str, Any]:
         """Plain values for an environment's ``info``."""
@@ -68,9 +68,10 @@ class World:
         self.contacts = ContactLog()
         self._space = pymunk.Space()
         self._space.gravity = (0.0, 0.0)
-        # No overlap is tolerated, and what there is vanishes at once: distances are in metres here,
-        # where Chipmunk's defaults think in pixels.
+        # Chipmunk's defaults think in pixels, here distances are in metres: hardly any overlap is
+        # tolerated, and the rest of it is gone after one step.
         self._space.collision_slop = 1e-4
+        self._space.collision_bias = 0.0
         robot = scenario.robot
         self._body = pymunk.Body(robot.mass, robot.inertia)
         self._shape = pymunk.Circle(self._body, robot.radius)
@@ -80,8 +81,6 @@ class World:
         if solid:
             self._add_obstacles()
             self._add_walls()
-        self._space.on_collision(_ROBOT, _OBSTACLE, begin=self._began, post_solve=self._solved)
-        self._space.on_collision(_ROBOT, _WALL, begin=self._began, post_solve=self._solved)
 
     @property
     def state(self) -> FloatArray:
@@ -98,51 +97,51 @@ class World:
 
     def kick(self, velocity_change: FloatArray) -> None:
         """Changes ``(v_x, v_y, omega)`` at once, as an impulse does."""
-        body, (dx, dy, turn) = self._body, (float(item) for item in velocity_change)
-        vx, vy = body.velocity
-        body.velocity = (vx + dx, vy + dy)
-        body.angular_velocity += turn
+        self._kick(*(float(item) for item in velocity_change))
 
     def advance(
-        self,
-        duration: float,
-        sub_steps: int,
-        wrench_body: Callable[[int], FloatArray] | None = None,
+        self, duration: float, sub_steps: int, wrenches_body: FloatArray | None = None
     ) -> None:
         """Advances the world.
 
         Args:
             duration: In s.
             sub_steps: Number of equal physics steps.
-            wrench_body: Gives the wrench ``(F_x, F_y, M)`` in the body frame for each sub-step;
-                None lets the robot drift.
+            wrenches_body: ``(sub_steps, 3)`` wrench ``(F_x, F_y, M)`` in N, N, N m, body frame,
+                of each sub-step; None lets the robot drift.
         """
-        h, robot = duration / sub_steps, self.scenario.robot
-        for index in range(sub_steps):
-            if wrench_body is None:
+        h = duration / sub_steps
+        if wrenches_body is None:
+            for _ in range(sub_steps):
                 self._space.step(h)
-                continue
-            fx, fy, torque = wrench_body(index)
+            return
+        body, robot = self._body, self.scenario.robot
+        for fx, fy, torque in wrenches_body.tolist():
             alpha = torque / robot.inertia
-            body = self._body
             middle = body.angle + 0.5 * h * (body.angular_velocity + 0.25 * h * alpha)
-            cos, sin = np.cos(middle), np.sin(middle)
-            force = np.array([cos * fx - sin * fy, sin * fx + cos * fy])
-            half = 0.5 * h * np.array([*(force / robot.mass), alpha])
-            self.kick(half)
+            cos, sin, gain = math.cos(middle), math.sin(middle), 0.5 * h / robot.mass
+            half = gain * (cos * fx - sin * fy), gain * (sin * fx + cos * fy), 0.5 * h * alpha
+            self._kick(*half)
             self._space.step(h)
-            self.kick(half)
+            self._kick(*half)
 
     def take_contacts(self) -> ContactLog:
         """The contacts since the last call."""
         log, self.contacts = self.contacts, ContactLog()
         return log
 
+    def _kick(self, dx: float, dy: float, turn: float) -> None:
+        body = self._body
+        vx, vy = body.velocity
+        body.velocity = (vx + dx, vy + dy)
+        body.angular_velocity += turn
+
     def _add_obstacles(self) -> None:
         obstacles = self.scenario.obstacles
         for index, (centre, radius) in enumerate(zip(obstacles.centres, obstacles.radii)):
             shape = pymunk.Circle(self._space.static_body, float(radius), tuple(centre))
-            self._add_static(shape, _OBSTACLE, index)
+            self._add_static(shape, _FIRST_OBSTACLE + index)
+            self._report(_FIRST_OBSTACLE + index, index)
 
     def _add_walls(self) -> None:
         width, height = self.scenario.table
@@ -151,23 +150,24 @@ class World:
         corners = [(left, low), (right, low), (right, high), (left, high)]
         for first, second in zip(corners, corners[1:] + corners[:1]):
             segment = pymunk.Segment(self._space.static_body, first, second, t)
-            self._add_static(segment, _WALL, "wall")
+            self._add_static(segment, _WALL)
+        self._report(_WALL, "wall")
 
-    def _add_static(self, shape: pymunk.Shape, kind: int, name: Any) -> None:
+    def _add_static(self, shape: pymunk.Shape, collision_type: int) -> None:
         shape.elasticity, shape.friction = self._surface
-        shape.collision_type = kind
-        shape.freeflyer_name = name
+        shape.collision_type = collision_type
         self._space.add(shape)
 
-    def _began(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:
+    def _report(self, collision_type: int, name: int | str) -> None:
+        """Logs contacts of the robot with shapes of a type under ``name``."""
+        self._space.on_collision(
+            _ROBOT, collision_type, begin=self._began, post_solve=self._solved, data=name
+        )
+
+    def _began(self, _arbiter: pymunk.Arbiter, _space: pymunk.Space, name: int | str) -> None:
         self.contacts.count += 1
-        self.contacts.bodies.add(_other(arbiter))
+        self.contacts.bodies.add(name)
 
-    def _solved(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:
+    def _solved(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, name: int | str) -> None:
         self.contacts.impulse += float(arbiter.total_impulse.length)
-        self.contacts.bodies.add(_other(arbiter))
-
-
-def _other(arbiter: pymunk.Arbiter) -> Any:
-    names = (getattr(shape, "freeflyer_name", None) for shape in arbiter.shapes)
-    return next(name for name in names if name is not None)
+        self.contacts.bodies.add(name)

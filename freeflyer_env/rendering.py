@@ -1,249 +1,347 @@
-"""Drawing only: table, obstacles, robot, planned and flown path, with pygame off-screen.
+"""Drawing only: a scene as an array of pixels, frames as a GIF.
 
-Everything is drawn at three times the size and scaled down, which smooths the edges.
+Everything is drawn three times as large on an off-screen pygame surface and scaled down, which
+smooths all edges; no window, display or video driver is needed. Colours are flat, so that GIFs are
+small.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
+from gymnasium.error import DependencyNotInstalled
 from numpy.typing import ArrayLike, NDArray
 
 from freeflyer_env.robot import FloatArray, Robot
 from freeflyer_env.scenario import Scenario
 
-_OVERSAMPLING = 3
-_MARGIN = 0.09  # m of frame around the table
+Color = tuple[int, int, int]
 
-_FRAME = (235, 236, 240)
-_TABLE = (250, 250, 252)
-_GRID = (236, 238, 243)
-_INK = (38, 42, 54)
-_OBSTACLE = (98, 104, 120)
-_KEEP_OUT = (222, 92, 84)
-_GOAL = (46, 158, 98)
-_PLAN = (54, 120, 224)
-_BODY = (250, 200, 84)
-_HULL = (255, 244, 214)
-_PLUME = (255, 132, 32)
+_SUPERSAMPLING = 3
+_MARGIN = 0.12  # m of surround on each side of the table
+_CAPTION = 0.24  # m below the table
 
-
-class _Canvas:
-    """A surface with metres for coordinates and the y axis upwards."""
-
-    def __init__(self, table: tuple[float, float], width: int, surface: Any = None) -> None:
-        self.pygame = _pygame()
-        self.scale = _OVERSAMPLING * width / (table[0] + 2 * _MARGIN)
-        self.height = table[1] + 2 * _MARGIN
-        size = (_OVERSAMPLING * width, round(self.height * self.scale))
-        self.surface = surface or self.pygame.Surface(size)
-
-    def pixel(self, point: ArrayLike) -> tuple[float, float]:
-        x, y = np.asarray(point, dtype=np.float64)
-        return (x + _MARGIN) * self.scale, (self.height - _MARGIN - y) * self.scale
-
-    def width_of(self, metres: float) -> int:
-        return max(1, round(metres * self.scale))
-
-    def disc(self, centre: ArrayLike, radius: float, colour: Any, line: float = 0.0) -> None:
-        width = self.width_of(line) if line else 0
-        self.pygame.draw.circle(
-            self.surface, colour, self.pixel(centre), radius * self.scale, width
-        )
-
-    def polygon(self, points: FloatArray, colour: Any) -> None:
-        self.pygame.draw.polygon(self.surface, colour, [self.pixel(p) for p in points])
-
-    def path(self, points: ArrayLike, colour: Any, line: float, dash: float = 0.0) -> None:
-        """A polyline with round joints; dashes of ``dash`` metres if positive."""
-        points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
-        if len(points) < 2:
-            return
-        pieces = _dashes(points, dash) if dash else [points]
-        for piece in pieces:
-            pixels = [self.pixel(p) for p in piece]
-            width = self.width_of(line)
-            self.pygame.draw.lines(self.surface, colour, False, pixels, width)
-            for pixel in pixels:
-                self.pygame.draw.circle(self.surface, colour, pixel, width / 2)
-
-    def ring(self, centre: ArrayLike, radius: float, colour: Any, line: float) -> None:
-        """A dashed circle."""
-        angles = np.linspace(0.0, 2 * np.pi, 121)
-        circle = np.asarray(centre) + radius * np.column_stack([np.cos(angles), np.sin(angles)])
-        self.path(circle, colour, line, dash=0.04)
-
-    def text(self, words: str, point: ArrayLike, size: float, colour: Any) -> None:
-        self.surface.blit(_font(self.width_of(size)).render(words, True, colour), self.pixel(point))
+_SURROUND: Color = (226, 230, 236)
+_FLOOR: Color = (250, 251, 253)
+_GRID: Color = (236, 239, 244)
+_EDGE: Color = (52, 63, 82)
+_INK: Color = (52, 63, 82)
+_KEEP_OUT: Color = (253, 240, 238)
+_KEEP_OUT_RING: Color = (224, 122, 110)
+_OBSTACLE: Color = (112, 124, 145)
+_OBSTACLE_RIM: Color = (78, 90, 112)
+_PLANNED: Color = (126, 168, 236)
+_FLOWN: Color = (236, 122, 28)
+_START: Color = (150, 160, 176)
+_GOAL: Color = (44, 150, 96)
+_HULL: Color = (214, 221, 232)
+_BODY: Color = (250, 251, 253)
+_PANEL: Color = (52, 88, 150)
+_FLAME: Color = (255, 150, 40)
+_FLAME_CORE: Color = (255, 226, 120)
 
 
 def draw_scene(
     scenario: Scenario,
     pose: ArrayLike,
     *,
+    start: ArrayLike | None = None,
     goal: ArrayLike | None = None,
     duties: ArrayLike | None = None,
     planned: ArrayLike | None = None,
     flown: ArrayLike | None = None,
     time: float | None = None,
-    width: int = 600,
+    width: int = 748,
 ) -> NDArray[np.uint8]:
-    """Draws one moment.
+    """Draws the table seen from above, x to the right and y upwards.
 
     Args:
-        scenario: Table, obstacles and robot.
-        pose: ``(3,)`` position in m and heading in rad of the robot.
-        goal: ``(3,)`` pose of the goal, drawn as an outline.
-        duties: ``(8,)`` in [0, 1], drawn as the plumes of the thrusters.
-        planned: ``(P, 2)`` positions, drawn dashed.
-        flown: ``(P, 2)`` positions, drawn solid.
-        time: In s, written in a corner.
+        scenario: Table, obstacles (keep-out radii dashed) and robot.
+        pose: ``(3,)`` robot pose ``(r_x, r_y, psi)`` in m, m, rad.
+        start: ``(3,)`` start pose, drawn as a grey ghost.
+        goal: ``(3,)`` goal pose, drawn as a green ghost.
+        duties: ``(8,)`` thruster duties in [0, 1]; a plume is as long as its duty is large.
+        planned: ``(N, 2)`` planned path in m, dashed.
+        flown: ``(K, 2)`` flown path in m, solid.
+        time: Time to print in s.
         width: Of the picture in pixels; the height follows from the table.
 
     Returns:
-        ``(H, W, 3)`` picture.
+        ``(H, W, 3)`` uint8; height and width are even, as video encoders want them.
 
     Raises:
-        gymnasium.error.DependencyNotInstalled: Without pygame.
+        gymnasium.error.DependencyNotInstalled: Without pygame (``pip install
+            "freeflyer-gym[render]"``).
     """
-    obstacles = tuple(map(tuple, scenario.obstacles.rows()))
-    background = _background(scenario.table, obstacles, tuple(scenario.keep_out_radii), int(width))
-    canvas = _Canvas(scenario.table, width, background.copy())
-    if goal is not None:
-        _draw_goal(canvas, scenario.robot, np.asarray(goal, dtype=np.float64))
+    discs = np.column_stack([scenario.obstacles.rows(), scenario.keep_out_radii])
+    table = _table_drawn(tuple(scenario.table), tuple(map(tuple, discs.tolist())), int(width))
+    canvas = _Canvas(scenario.table, width, table.copy())
+    for ghost, color in ((start, _START), (goal, _GOAL)):
+        if ghost is not None:
+            _draw_ghost(canvas, scenario.robot, np.asarray(ghost), color)
     if planned is not None:
-        canvas.path(planned, _PLAN, 0.014, dash=0.05)
+        for dash in _dashes(canvas.pixels(planned), canvas.length(0.045), canvas.length(0.035)):
+            canvas.polyline(dash, 0.02, _PLANNED)
     if flown is not None:
-        canvas.path(flown, _INK, 0.012)
+        canvas.polyline(_thinned(canvas.pixels(flown)), 0.011, _FLOWN)
     _draw_robot(canvas, scenario.robot, np.asarray(pose, dtype=np.float64), duties)
-    if time is not None:
-        canvas.text(f"{time:.1f} s", (0.05, scenario.table[1] - 0.04), 0.13, _INK)
-    return _finish(canvas, width)
+    _draw_caption(canvas, time, planned is not None, flown is not None)
+    return canvas.array()
 
 
 def save_gif(frames: Sequence[NDArray[np.uint8]], path: str | Path, fps: float = 10.0) -> None:
-    """Writes frames ``(H, W, 3)`` as an endless GIF with one palette for all of them."""
-    from PIL import Image
+    """Writes frames ``(H, W, 3)`` uint8 as a GIF that plays in a loop.
 
-    if not frames:
+    All frames share one palette; with flat colours and without dithering a frame stores little
+    more than what moved.
+
+    Raises:
+        ValueError: Without frames, or if ``fps`` is not positive.
+        gymnasium.error.DependencyNotInstalled: Without Pillow.
+    """
+    if len(frames) == 0:
         raise ValueError("save_gif needs at least one frame.")
-    sheet = Image.fromarray(np.concatenate([frames[0], frames[len(frames) // 2], frames[-1]]))
-    palette = sheet.quantize(64, dither=Image.Dither.NONE)
+    if not fps > 0.0:
+        raise ValueError(f"fps must be positive, got {fps}.")
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise DependencyNotInstalled(
+            'Pillow is not installed: pip install "freeflyer-gym[render]"'
+        ) from error
+    # Plumes and paths are not in every frame: the palette is made from several.
+    chosen = [frames[i] for i in np.linspace(0, len(frames) - 1, 6).astype(int)]
+    palette = Image.fromarray(np.concatenate(chosen)).quantize(64)
     images = [
         Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
         for frame in frames
     ]
+    # GIF counts in hundredths of a second.
     images[0].save(
-        path, save_all=True, append_images=images[1:], duration=round(1000 / fps), loop=0
+        path,
+        save_all=True,
+        append_images=images[1:],
+        duration=10 * max(round(100.0 / fps), 1),
+        loop=0,
     )
 
 
-@lru_cache(maxsize=8)
-def _background(
-    table: tuple[float, float],
-    obstacles: tuple[tuple[float, float, float], ...],
-    keep_out_radii: tuple[float, ...],
-    width: int,
-) -> Any:
-    canvas = _Canvas(table, width)
-    canvas.surface.fill(_FRAME)
-    corners = np.array([(0, 0), (table[0], 0), table, (0, table[1])], dtype=np.float64)
-    canvas.polygon(corners, _TABLE)
-    for x in np.arange(0.5, table[0], 0.5):
-        canvas.path([(x, 0), (x, table[1])], _GRID, 0.006)
-    for y in np.arange(0.5, table[1], 0.5):
-        canvas.path([(0, y), (table[0], y)], _GRID, 0.006)
-    canvas.path([*corners, corners[0]], _OBSTACLE, 0.012)
-    for (x, y, radius), keep_out in zip(obstacles, keep_out_radii):
-        canvas.disc((x, y), radius, _OBSTACLE)
-        canvas.ring((x, y), keep_out, _KEEP_OUT, 0.008)
-    bar = np.array([(table[0] - 0.6, 0.08), (table[0] - 0.1, 0.08)])
-    canvas.path(bar, _INK, 0.012)
-    canvas.text("0.5 m", (table[0] - 0.45, 0.21), 0.1, _INK)
-    return canvas.surface
+class _Canvas:
+    """An off-screen surface with metric coordinates."""
+
+    def __init__(self, table: tuple[float, float], width: int, surface: Any = None) -> None:
+        if width < 100:
+            raise ValueError(f"width must be at least 100 pixels, got {width}.")
+        self.pygame = _import_pygame()
+        pixels_per_metre = width / (table[0] + 2 * _MARGIN)
+        height = (table[1] + _MARGIN + _CAPTION) * pixels_per_metre
+        self.table, self.scale = table, _SUPERSAMPLING * pixels_per_metre
+        self.size = (2 * (width // 2), 2 * round(height / 2))
+        large = (self.size[0] * _SUPERSAMPLING, self.size[1] * _SUPERSAMPLING)
+        self.surface = surface or self.pygame.Surface(large, depth=24)
+
+    def pixels(self, points: Any) -> FloatArray:
+        """Points ``(..., 2)`` in m as pixels of the large surface."""
+        points = np.asarray(points, dtype=np.float64)
+        origin = np.array([_MARGIN, self.table[1] + _MARGIN])
+        return (origin + points * (1.0, -1.0)) * self.scale
+
+    def length(self, metres: float) -> float:
+        """A length in pixels of the large surface."""
+        return metres * self.scale
+
+    def disc(self, centre: Any, radius: float, color: Color) -> None:
+        self.pygame.draw.circle(self.surface, color, self.pixels(centre), self.length(radius))
+
+    def polygon(self, points: Any, color: Color) -> None:
+        self.pygame.draw.polygon(self.surface, color, self.pixels(points))
+
+    def ring(
+        self, centre: Any, radius: float, width: float, color: Color, n_dashes: int = 0
+    ) -> None:
+        """A circle's outline, in dashes if a number of them is given."""
+        angles = np.linspace(0.0, 2.0 * np.pi, 241)
+        circle = radius * np.column_stack([np.cos(angles), np.sin(angles)])
+        circle = self.pixels(np.asarray(centre) + circle)
+        if not n_dashes:
+            self.polyline(circle, width, color)
+            return
+        part = self.length(2.0 * np.pi * radius) / (2 * n_dashes)
+        for piece in _dashes(circle, part, part):
+            self.polyline(piece, width, color)
+
+    def polyline(self, points: FloatArray, width: float, color: Color) -> None:
+        """A line of ``width`` m with round joints through pixels ``(K, 2)``."""
+        half = 0.5 * self.length(width)
+        for point in points:
+            self.pygame.draw.circle(self.surface, color, point, half)
+        for first, second in pairwise(points):
+            along = second - first
+            distance = float(np.hypot(*along))
+            if distance > 0.0:
+                side = half / distance * np.array([-along[1], along[0]])
+                corners = [first + side, second + side, second - side, first - side]
+                self.pygame.draw.polygon(self.surface, color, corners)
+
+    def text(self, text: str, position: Any, color: Color, align: float = 0.0) -> float:
+        """Writes a line 0.09 m high, centred in height; returns its width in m."""
+        picture = _font(round(self.length(0.13))).render(text, True, color)
+        x, y = self.pixels(position)
+        width, height = picture.get_size()
+        self.surface.blit(picture, (round(x - align * width), round(y - 0.5 * height)))
+        return float(width / self.scale)
+
+    def array(self) -> NDArray[np.uint8]:
+        """The picture, scaled down: ``(H, W, 3)``."""
+        small = self.pygame.transform.smoothscale(self.surface, self.size)
+        return np.ascontiguousarray(self.pygame.surfarray.array3d(small).swapaxes(0, 1))
 
 
-def _draw_robot(canvas: _Canvas, robot: Robot, pose: FloatArray, duties: ArrayLike | None) -> None:
-    turn = _rotation(pose[2])
-    if duties is not None:
-        for duty, place, push in zip(
-            np.asarray(duties), robot.thruster_positions, robot.thruster_directions
-        ):
-            if duty > 0.02:
-                _draw_plume(canvas, pose, turn, place, push, float(duty))
-    canvas.disc(pose[:2], robot.radius, _HULL)
-    canvas.disc(pose[:2], robot.radius, _INK, 0.01)
-    half = 0.66 * robot.radius
-    square = half * np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)], dtype=np.float64)
-    canvas.polygon(pose[:2] + square @ turn.T, _BODY)
-    for place, push in zip(robot.thruster_positions, robot.thruster_directions):
-        canvas.disc(pose[:2] + turn @ (place + 0.012 * push), 0.014, _INK)
-    nose = robot.radius * np.array([(0.9, 0.0), (0.45, 0.22), (0.45, -0.22)])
-    canvas.polygon(pose[:2] + nose @ turn.T, _INK)
-
-
-def _draw_plume(
-    canvas: _Canvas,
-    pose: FloatArray,
-    turn: FloatArray,
-    place: FloatArray,
-    push: FloatArray,
-    duty: float,
-) -> None:
-    side = np.array([-push[1], push[0]])
-    for length, half, colour in ((0.2, 0.032, _PLUME), (0.12, 0.018, (255, 222, 120))):
-        tip = place - push * length * (0.25 + 0.75 * duty)
-        corners = np.array([place + side * half, tip, place - side * half])
-        canvas.polygon(pose[:2] + corners @ turn.T, colour)
-
-
-def _draw_goal(canvas: _Canvas, robot: Robot, goal: FloatArray) -> None:
-    canvas.ring(goal[:2], robot.radius, _GOAL, 0.014)
-    nose = goal[:2] + _rotation(goal[2]) @ np.array([robot.radius, 0.0])
-    canvas.path([goal[:2], nose], _GOAL, 0.014)
-    canvas.disc(goal[:2], 0.018, _GOAL)
-
-
-def _dashes(points: FloatArray, dash: float) -> list[FloatArray]:
-    """Cuts a polyline into dashes of length ``dash`` with gaps of two thirds of that."""
-    lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
-    arc = np.concatenate([[0.0], np.cumsum(lengths)])
-    pieces = []
-    for first in np.arange(0.0, arc[-1], dash * 5.0 / 3.0):
-        s = np.linspace(first, min(first + dash, arc[-1]), 4)
-        pieces.append(np.column_stack([np.interp(s, arc, points[:, k]) for k in range(2)]))
-    return pieces
-
-
-def _rotation(angle: float) -> FloatArray:
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.array([[cos, -sin], [sin, cos]])
-
-
-def _finish(canvas: _Canvas, width: int) -> NDArray[np.uint8]:
-    height = round(canvas.surface.get_height() / _OVERSAMPLING)
-    small = canvas.pygame.transform.smoothscale(canvas.surface, (width, height))
-    picture = canvas.pygame.surfarray.array3d(small)
-    return np.ascontiguousarray(np.transpose(picture, (1, 0, 2)), dtype=np.uint8)
+def _import_pygame() -> Any:
+    # The greeting would spoil a command's machine-readable output.
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        import pygame
+    except ImportError as error:
+        raise DependencyNotInstalled(
+            'pygame is not installed: pip install "freeflyer-gym[render]"'
+        ) from error
+    pygame.font.init()
+    return pygame
 
 
 @lru_cache(maxsize=8)
 def _font(size: int) -> Any:
-    pygame = _pygame()
-    pygame.font.init()
-    return pygame.font.Font(None, size)
+    return _import_pygame().font.Font(None, size)
 
 
-def _pygame() -> Any:
-    try:
-        import pygame
-    except ImportError as error:
-        raise gym.error.DependencyNotInstalled(
-            'Rendering needs pygame: pip install "freeflyer-gym[render]".'
-        ) from error
-    return pygame
+@lru_cache(maxsize=8)
+def _table_drawn(
+    table: tuple[float, float], discs: tuple[tuple[float, ...], ...], width_pixels: int
+) -> Any:
+    """Surface with what does not move; discs are rows ``(x, y, radius, keep-out radius)``."""
+    canvas, (width, height), edge = _Canvas(table, width_pixels), table, 0.018
+    canvas.surface.fill(_SURROUND)
+    canvas.polygon(_box(0.0, 0.0, width, height), _FLOOR)
+    for x, y, _, keep_out in discs:
+        canvas.disc((x, y), keep_out, _KEEP_OUT)
+    for x in np.arange(0.5, width, 0.5):
+        canvas.polygon(_box(x - 0.002, 0.0, x + 0.002, height), _GRID)
+    for y in np.arange(0.5, height, 0.5):
+        canvas.polygon(_box(0.0, y - 0.002, width, y + 0.002), _GRID)
+    for x, y, _, keep_out in discs:
+        canvas.ring((x, y), keep_out, 0.006, _KEEP_OUT_RING, n_dashes=round(60 * keep_out))
+    for x, y, radius, _ in discs:
+        canvas.disc((x, y), radius, _OBSTACLE_RIM)
+        canvas.disc((x, y), radius - 0.012, _OBSTACLE)
+    # Keep-out discs may reach over the edge of the table.
+    for strip in (
+        _box(-_MARGIN, -_CAPTION, width + _MARGIN, -edge),
+        _box(-_MARGIN, height + edge, width + _MARGIN, height + _MARGIN),
+        _box(-_MARGIN, -edge, -edge, height + edge),
+        _box(width + edge, -edge, width + _MARGIN, height + edge),
+    ):
+        canvas.polygon(strip, _SURROUND)
+    corners = canvas.pixels(_box(-edge / 2, -edge / 2, width + edge / 2, height + edge / 2))
+    canvas.polyline(np.vstack([corners, corners[:1]]), edge, _EDGE)
+    return canvas.surface
+
+
+def _draw_ghost(canvas: _Canvas, robot: Robot, pose: FloatArray, color: Color) -> None:
+    """Outline of the robot with its heading."""
+    radius = robot.radius
+    canvas.ring(pose[:2], radius - 0.006, 0.012, color)
+    half = 0.58 * radius
+    square = canvas.pixels(_placed(_box(-half, -half, half, half), pose))
+    canvas.polyline(np.vstack([square, square[:1]]), 0.007, color)
+    nose = [(0.95 * radius, 0.0), (0.66 * radius, 0.2 * radius), (0.66 * radius, -0.2 * radius)]
+    canvas.polygon(_placed(nose, pose), color)
+
+
+def _draw_robot(canvas: _Canvas, robot: Robot, pose: FloatArray, duties: ArrayLike | None) -> None:
+    """A square body with a nose in a disc hull; plumes where thrusters fire."""
+    radius, unit = robot.radius, robot.radius / 0.15
+    nozzles = list(zip(robot.thruster_positions, -robot.thruster_directions))
+    for (position, exhaust), duty in zip(
+        nozzles, np.zeros(8) if duties is None else np.asarray(duties)
+    ):
+        if duty > 0.0:
+            across = np.array([-exhaust[1], exhaust[0]])
+            for size, color in ((1.0, _FLAME), (0.55, _FLAME_CORE)):
+                tip = position + unit * size * (0.07 + 0.13 * duty) * exhaust
+                bulge = position + unit * size * (0.02 + 0.03 * duty) * exhaust
+                side = unit * size * 0.024 * across
+                flame = [position + 0.5 * side, bulge + side, tip, bulge - side]
+                canvas.polygon(_placed([*flame, position - 0.5 * side], pose), color)
+    canvas.disc(pose[:2], radius, _EDGE)
+    canvas.disc(pose[:2], radius - 0.01 * unit, _HULL)
+    for position, exhaust in nozzles:
+        across = 0.013 * unit * np.array([-exhaust[1], exhaust[0]])
+        base = position - 0.028 * unit * exhaust
+        cone = [base - 0.5 * across, position - across, position + across, base + 0.5 * across]
+        canvas.polygon(_placed(cone, pose), _EDGE)
+    half = 0.62 * radius
+    canvas.polygon(_placed(_box(-half, -half, half, half), pose), _EDGE)
+    half -= 0.009 * unit
+    canvas.polygon(_placed(_box(-half, -half, half, half), pose), _BODY)
+    canvas.polygon(_placed(_box(-0.7 * half, -0.72 * half, -0.1 * half, 0.72 * half), pose), _PANEL)
+    nose = half * np.array([(0.85, 0.0), (0.2, 0.5), (0.2, -0.5)])
+    canvas.polygon(_placed(nose, pose), _FLOWN)
+
+
+def _draw_caption(canvas: _Canvas, time: float | None, planned: bool, flown: bool) -> None:
+    """Time on the left, what the lines are in the middle, a scale bar on the right."""
+    width, y = canvas.table[0], -0.5 * (_CAPTION + 0.018)
+    if time is not None:
+        canvas.text(f"{time:5.1f} s", (0.0, y), _INK)
+    x = 0.5 * width - 0.5
+    for shown, name, color, dashed in (
+        (planned, "planned", _PLANNED, True),
+        (flown, "flown", _FLOWN, False),
+    ):
+        if shown:
+            line = canvas.pixels([(x, y), (x + 0.2, y)])
+            on = canvas.length(0.045)
+            for piece in _dashes(line, on, canvas.length(0.035)) if dashed else [line]:
+                canvas.polyline(piece, 0.016, color)
+            x += 0.25 + canvas.text(name, (x + 0.25, y), _INK) + 0.2
+    bar = canvas.pixels([(width - 0.5, y + 0.02), (width - 0.5, y - 0.02)])
+    canvas.polyline(bar, 0.01, _INK)
+    canvas.polyline(bar + np.array([canvas.length(0.5), 0.0]), 0.01, _INK)
+    canvas.polyline(canvas.pixels([(width - 0.5, y), (width, y)]), 0.01, _INK)
+    canvas.text("0.5 m", (width - 0.56, y), _INK, align=1.0)
+
+
+def _box(left: float, low: float, right: float, high: float) -> FloatArray:
+    return np.array([(left, low), (right, low), (right, high), (left, high)])
+
+
+def _placed(points: Any, pose: FloatArray) -> FloatArray:
+    """Body-frame points ``(K, 2)`` on the table."""
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return pose[:2] + np.asarray(points) @ np.array([[cos, sin], [-sin, cos]])
+
+
+def _thinned(points: FloatArray) -> FloatArray:
+    """Pixels ``(K, 2)`` without those too close to the one before to be seen apart."""
+    kept = [0]
+    for index, point in enumerate(points):
+        if np.hypot(*(point - points[kept[-1]])) >= _SUPERSAMPLING:
+            kept.append(index)
+    return points[[*kept, len(points) - 1]]
+
+
+def _dashes(points: FloatArray, on: float, off: float) -> Iterator[FloatArray]:
+    """Cuts a line through pixels ``(K, 2)`` into dashes ``on`` long, ``off`` apart."""
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
+    for begin in np.arange(0.0, along[-1], on + off):
+        end = min(begin + on, along[-1])
+        inside = along[(along > begin) & (along < end)]
+        cuts = np.concatenate([[begin], inside, [end]])
+        yield np.column_stack([np.interp(cuts, along, axis) for axis in points.T])

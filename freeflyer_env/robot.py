@@ -29,6 +29,9 @@ FloatArray = NDArray[np.float64]
 #: For each cluster the thruster that pushes it forwards and the one that pushes it backwards.
 CLUSTER_THRUSTERS = ((7, 0), (2, 1), (4, 3), (5, 6))
 
+# Cluster thrusts that cancel out: what can be added without changing the wrench.
+_FREE_CLUSTERS = np.array([1.0, 1.0, -1.0, -1.0])
+
 
 @dataclass(frozen=True)
 class Robot:
@@ -121,7 +124,8 @@ class Robot:
     def allocate(self, wrench_body: FloatArray) -> FloatArray:
         """Thruster duties that realise a body wrench as nearly as the thrusters can.
 
-        Every realisable wrench is met exactly; one beyond reach is scaled down, its direction kept.
+        Every realisable wrench is met exactly, with the least propellant; one beyond reach is
+        scaled down, its direction kept.
 
         Args:
             wrench_body: ``(..., 3)`` force and torque ``(F_x, F_y, M)`` in N, N, N m, body frame.
@@ -129,12 +133,20 @@ class Robot:
         Returns:
             ``(..., 8)`` duties in [0, 1].
         """
-        clusters = self._balanced_clusters(wrench_body) / self.thrust
+        signed = self._signed_clusters(wrench_body) / self.thrust
+        ordered = np.sort(signed, axis=-1)
+        # The sum of magnitudes is smallest between the two middle values, and every magnitude is
+        # within 1 from `low` to `high`; where nothing is, the middle needs the least scaling.
+        shift = np.maximum(np.minimum(0.0, ordered[..., 2]), ordered[..., 1])
+        low, high = ordered[..., 3] - 1.0, ordered[..., 0] + 1.0
+        shift = np.maximum(np.minimum(shift, high), low)
+        shift = np.where(low > high, 0.5 * (low + high), shift)
+        clusters = (signed - shift[..., None]) * _FREE_CLUSTERS
         clusters = clusters / np.maximum(np.abs(clusters).max(axis=-1, keepdims=True), 1.0)
         duties = np.zeros((*clusters.shape[:-1], 8))
-        for index, (forward, backward) in enumerate(CLUSTER_THRUSTERS):
-            duties[..., forward] = np.maximum(clusters[..., index], 0.0)
-            duties[..., backward] = np.maximum(-clusters[..., index], 0.0)
+        forward, backward = zip(*CLUSTER_THRUSTERS)
+        duties[..., forward] = np.maximum(clusters, 0.0)
+        duties[..., backward] = np.maximum(-clusters, 0.0)
         return duties
 
     def reach(self, control_body: FloatArray, dt: float) -> FloatArray:
@@ -144,19 +156,12 @@ class Robot:
             control_body: ``(..., 3)`` impulses per unit mass ``(dv_x, dv_y, h)``, body frame.
             dt: Time in s in which to deliver them.
         """
-        clusters = self._balanced_clusters(control_body)
-        return np.abs(clusters).max(axis=-1) / self.delta_v_max(dt)
+        signed = self._signed_clusters(control_body)
+        return 0.5 * (signed.max(axis=-1) - signed.min(axis=-1)) / self.delta_v_max(dt)
 
-    def _balanced_clusters(self, target: FloatArray) -> FloatArray:
-        """Cluster thrusts ``(..., 4)`` for a wrench, with the smallest possible maximum.
-
-        The four clusters have one internal degree of freedom, ``(1, 1, -1, -1)``.
-        """
-        clusters = np.asarray(target, dtype=np.float64) @ self.cluster_inverse.T
-        null = np.array([1.0, 1.0, -1.0, -1.0])
-        signed = clusters * null
-        middle = 0.5 * (signed.max(axis=-1) + signed.min(axis=-1))
-        return clusters - middle[..., None] * null
+    def _signed_clusters(self, target: FloatArray) -> FloatArray:
+        """Pseudo-inverse cluster thrusts ``(..., 4)``, with signs that make the freedom a shift."""
+        return np.asarray(target, dtype=np.float64) @ self.cluster_inverse.T * _FREE_CLUSTERS
 
 
 def body_from_world(psi: FloatArray | float, vector: FloatArray) -> FloatArray:

@@ -9,7 +9,15 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from freeflyer_env import HELD_OUT_SCENES, Problem, dynamics, sample_problem
+from freeflyer_env import (
+    HELD_OUT_SCENES,
+    Obstacles,
+    Problem,
+    Robot,
+    Scenario,
+    dynamics,
+    sample_problem,
+)
 from freeflyer_env.planning import solve_multistart
 
 MODES = ["delta_v", "thrusters", "on_off"]
@@ -169,6 +177,9 @@ def test_problems_can_be_given_as_mappings_or_observations():
         ({"goal_tolerance": (0.1, 0.1, 0.1)}, "four positive numbers"),
         ({"restitution": 2.0}, "restitution must be in"),
         ({"scenario": "nominal", "max_obstacles": 2}, "at least the scene's 4"),
+        ({"final_time": 300.0}, "at most 200 s"),
+        ({"scenario": [[4.0, 1.0, 0.1]]}, "obstacles is outside the observation space"),
+        ({"render_mode": "ansi"}, "render_mode must be None or 'rgb_array'"),
     ],
 )
 def test_bad_arguments(arguments, message):
@@ -189,6 +200,64 @@ def test_bad_problems_are_refused_in_one_line():
         )
     with pytest.raises(ValueError, match="at most 200 s"):
         env.reset(options={"problem": {**inside, "obstacles": [], "final_time": 300.0}})
+    with pytest.raises(ValueError, match="start is outside the observation space"):
+        env.reset(options={"problem": {**inside, "obstacles": [], "start": [1, 1, 0, 50, 0, 0]}})
+    with pytest.raises(ValueError, match="a Problem or a mapping, got list"):
+        env.reset(options={"problem": [1, 2]})
+    with pytest.raises(ValueError, match=r"only the option 'problem', got \['problm'\]"):
+        env.reset(options={"problm": inside})
+    light = Scenario(robot=Robot(mass=10.0), obstacles=Obstacles.from_rows([]))
+    other = sample_problem(np.random.default_rng(0), light)
+    with pytest.raises(ValueError, match=r"robot is .* scenario=problem.scenario"):
+        env.reset(options={"problem": other})
+
+
+def test_a_refused_problem_leaves_the_episode_as_it_was():
+    env = make()
+    first, _ = env.reset(seed=0)
+    bad = {**first, "state": [9.0, 1, 0, 0, 0, 0]}
+    with pytest.raises(ValueError, match="off the table"):
+        env.reset(options={"problem": bad})
+    after, *_ = env.step(np.zeros(3))
+    np.testing.assert_array_equal(after["state"], first["state"])
+    np.testing.assert_array_equal(after["obstacles"], first["obstacles"])
+
+
+def test_arguments_can_be_stored_in_a_spec():
+    env = make(action_mode="on_off", scenario=[[2.0, 1.2, 0.2]], goal_tolerance=(0.1, 0.1, 0.1, 1))
+    spec = gym.envs.registration.EnvSpec.from_json(env.spec.to_json())
+    again = gym.make(spec)
+    assert again.observation_space == env.observation_space
+    assert again.action_space == env.action_space
+    np.testing.assert_array_equal(again.reset(seed=3)[0]["goal"], env.reset(seed=3)[0]["goal"])
+
+
+def test_without_contacts_the_episode_ends_where_the_table_does():
+    env = make(scenario=[[1.0, 1.2, 0.2]], contacts=False)
+    scenario = env.unwrapped.scenario
+    problem = Problem(scenario, [0.5, 1.2, 0, 0.2, 0, 0], [3.2, 1.2, 0, 0, 0, 0], 40.0)
+    env.reset(options={"problem": problem})
+    truncated, steps = False, 0
+    while not truncated:
+        observation, _, terminated, truncated, info = env.step(np.zeros(3))
+        assert env.observation_space.contains(observation)
+        assert not terminated
+        assert info["contacts"]["count"] == 0
+        steps += 1
+    assert steps == 31
+    assert env.unwrapped.state[0] == pytest.approx(3.6)
+
+
+def test_the_propellant_of_the_thruster_modes_is_the_cost():
+    for mode, action in (("thrusters", np.full(8, 0.25)), ("on_off", np.eye(8)[2])):
+        env = make(action_mode=mode)
+        env.reset(seed=0)
+        rewards = [env.step(action.astype(env.action_space.dtype))[1] for _ in range(20)]
+        info = env.step(np.zeros(8, dtype=env.action_space.dtype))[4]
+        expected = 0.2 / 16.0 * 0.1 * 20 * action.sum()
+        assert -sum(rewards) == pytest.approx(expected)
+        assert info["cost"] == pytest.approx(expected)
+        assert 0.2 / 16.0 * info["firing_time"].sum() == pytest.approx(expected)
 
 
 def test_bad_actions_and_calls():

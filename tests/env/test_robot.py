@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 
 from freeflyer_env import Robot
 from freeflyer_env.robot import body_from_world
@@ -48,6 +49,13 @@ def test_every_realisable_wrench_is_met_exactly():
     assert allocated.min() >= 0.0
     assert allocated.max() <= 1.0
     np.testing.assert_allclose(allocated @ ROBOT.wrench_matrix.T, wrenches, atol=1e-12)
+
+
+def test_no_other_allocation_needs_less_propellant():
+    wrenches = np.random.default_rng(2).uniform(0, 1, (50, 8)) @ ROBOT.wrench_matrix.T
+    for wrench, duties in zip(wrenches, ROBOT.allocate(wrenches)):
+        least = linprog(np.ones(8), A_eq=ROBOT.wrench_matrix, b_eq=wrench, bounds=(0.0, 1.0))
+        assert duties.sum() == pytest.approx(least.fun, abs=1e-7)
 
 
 def test_beyond_reach_the_direction_is_kept():
