@@ -113,7 +113,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     * `success_reward`: added to the reward on success.
     * `terminate_early`: whether success ends the episode before the final time.
     * `goal_tolerance`: `(position m, heading rad, speed m/s, rate rad/s)`.
-    * `sub_steps`: physics steps in a control step.
+    * `sub_steps`: physics steps in a control step. Free flight does not depend on them; contacts
+      are found at their ends, after an overlap of up to one sub-step's motion (50 ms in `delta_v`).
     * `max_obstacles`: rows of the `obstacles` observation; default: the scene's, at least 4.
     * `restitution`, `friction`: of all contacts.
     * `contacts`: `False` lets the robot pass through obstacles and walls, as in the optimal control

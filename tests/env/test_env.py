@@ -182,6 +182,7 @@ def test_problems_can_be_given_as_mappings_or_observations():
         ({"render_mode": "ansi"}, "render_mode must be None or 'rgb_array'"),
     ],
 )
+@pytest.mark.filterwarnings("ignore:.*render_mode='ansi'")
 def test_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         make(**arguments).reset()
