@@ -23,13 +23,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the ``freeflyer`` script; returns the exit code."""
     parser = _parser()
     options = parser.parse_args(arguments)
+    options.given = set(arguments if arguments is not None else sys.argv[1:])
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         options.run(options)
     except KeyboardInterrupt:
-        print("interrupted; the same command resumes long work", file=sys.stderr)
+        print("interrupted; generate and train resume with the same command", file=sys.stderr)
         return 130
-    except (ValueError, FileNotFoundError, IsADirectoryError, ModuleNotFoundError) as error:
+    except (ValueError, OSError, ModuleNotFoundError) as error:
         message = " ".join(str(error).split())
         print(f"freeflyer {options.command}: error: {message}", file=sys.stderr)
         return 2
@@ -40,47 +41,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _plan(options: argparse.Namespace) -> None:
+    _check_out(options.out, (".json", ".png"))
     problem = _problem(options)
     plan = _planner(options).plan(problem)
     summary = {"problem": problem.to_dict(), **_plan_summary(plan)}
     if options.out:
-        trajectory = plan.result.trajectory
-        _write(options.out, problem, plan, trajectory.states if trajectory is not None else None)
+        _write(options.out, problem, plan)
         summary["out"] = str(options.out)
     _print(options, summary, _plan_text(plan))
 
 
 def _fly(options: argparse.Namespace) -> None:
-    import gymnasium as gym
+    from art_policy.figures import fly_and_film
 
-    from freeflyer_env.control import fly
-
+    _check_out(options.out, (".gif",))
     problem = _problem(options)
     plan = _planner(options).plan(problem)
     if plan.trajectory is None:
         raise ValueError(f"there is no plan to fly: {plan.result.message}")
-    env = gym.make(
-        "freeflyer_env:FreeFlyer-v0",
-        action_mode="thrusters",
-        scenario=problem.scenario,
-        terminate_early=False,
-        render_mode="rgb_array" if options.out else None,
-    )
-    env.reset(options={"problem": problem})
-    base: Any = env.unwrapped
-    base.set_plan(plan.trajectory.states)
-    frames: list[Any] = []
-    if options.out:
-        _require_suffix(options.out, (".gif",))
-        frames.append(env.render())
-    drawn = [0]
-
-    def draw() -> None:
-        drawn[0] += 1
-        if options.out and drawn[0] % 4 == 0:
-            frames.append(env.render())
-
-    flight = fly(env, plan.trajectory, on_step=draw)
+    flight, frames = fly_and_film(problem, plan, film=bool(options.out))
     summary = {**_plan_summary(plan), "flight": flight_summary(flight)}
     if options.out:
         from freeflyer_env.rendering import save_gif
@@ -105,6 +84,8 @@ def _generate(options: argparse.Namespace) -> None:
     )
     where = f" in {options.out}" if options.out else ""
     text = f"made {dataset}{where}; load it with minari.load_dataset({dataset!r})"
+    if options.out:
+        text += f" and MINARI_DATASETS_PATH={options.out}"
     _print(options, {"dataset": dataset, "out": options.out}, text)
 
 
@@ -113,21 +94,22 @@ def _train(options: argparse.Namespace) -> None:
     from art_policy.train import TrainConfig, train
     from freeflyer_datasets import PackedDataset
 
+    presets: dict[str, Callable[..., ARTConfig]] = {
+        "multi_hypothesis": ARTConfig,
+        "autoregressive": ARTConfig.paper,
+        "autoregressive_small": ARTConfig.small,
+    }
+    model_config = _configure(presets[options.head], "--model-config", options.model_config)
+    length = {"max_minutes": options.minutes, "max_steps": options.steps, "seed": options.seed}
+    config = _configure(TrainConfig, "--train-config", options.train_config, **length)
+    _check_out(options.out, ())
     if Path(options.dataset).is_dir():
         folder = Path(options.dataset)
         is_packed = (folder / "meta.json").is_file()
         dataset = PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
     else:
         dataset = PackedDataset.from_minari(options.dataset)
-    presets: dict[str, Callable[..., ARTConfig]] = {
-        "multi_hypothesis": ARTConfig,
-        "autoregressive": ARTConfig.paper,
-        "autoregressive_small": ARTConfig.small,
-    }
-    changes = json.loads(options.model_config or "{}")
-    training = {"seed": options.seed, **json.loads(options.train_config or "{}")}
-    config = TrainConfig(max_minutes=options.minutes, max_steps=options.steps, **training)
-    model = train(dataset, presets[options.head](**changes), config, options.out)
+    model = train(dataset, model_config, config, options.out)
     text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
     _print(
         options,
@@ -147,6 +129,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from art_policy.model import ART
 
     ART.from_pretrained(options.model)  # a wrong name is an error before the work begins
+    _check_out(options.out, (".json",))
     problems = evaluation_problems(
         options.problems, options.scenes, options.final_time, options.seed
     )
@@ -175,7 +158,7 @@ def _render(options: argparse.Namespace) -> None:
     from freeflyer_env import Problem
     from freeflyer_env.rendering import draw_scene, save_gif
 
-    _require_suffix(options.out, (".gif", ".png"))
+    _check_out(options.out, (".gif", ".png"))
     dataset = minari.load_dataset(options.dataset)
     if not 0 <= options.episode < dataset.total_episodes:
         raise ValueError(
@@ -237,7 +220,11 @@ def _problem(options: argparse.Namespace) -> Any:
     from freeflyer_env import Problem, Scenario, sample_problem, unwrap_goal
 
     if options.problem:
+        if clash := options.given & {"--scene", "--final-time", "--start", "--goal"}:
+            raise ValueError(f"--problem says it all; leave out {', '.join(sorted(clash))}")
         data = json.loads(Path(options.problem).read_text(encoding="utf-8"))
+        if not isinstance(data, dict):
+            raise ValueError(f"{options.problem} must hold a JSON object with start, goal, ...")
         return Problem.from_dict(data.get("problem", data)).require_valid()
     scenario = None if options.scene == "random" else Scenario.named(options.scene)
     rng = np.random.default_rng(options.seed)
@@ -261,9 +248,31 @@ def _planner(options: argparse.Namespace) -> Any:
     return WarmStartPlanner(model, PlannerConfig(n_candidates=options.candidates))
 
 
-def _require_suffix(path: str, suffixes: tuple[str, ...]) -> None:
-    if Path(path).suffix not in suffixes:
+def _configure(make: Callable[..., Any], option: str, text: str | None, **values: Any) -> Any:
+    """Makes a configuration from the JSON of an option; any mistake in it is a ``ValueError``."""
+    try:
+        changes = json.loads(text or "{}")
+        return make(**{**values, **changes})
+    except (TypeError, AttributeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{option} must be a JSON object of settings: {error}") from None
+
+
+def _check_out(path: str | None, suffixes: tuple[str, ...]) -> None:
+    """Refuses an output file that cannot be written before the work, not after it."""
+    if path is None:
+        return
+    if suffixes and Path(path).suffix not in suffixes:
         raise ValueError(f"--out must end in {' or '.join(suffixes)}, got {path!r}")
+    if suffixes and Path(path).is_dir():
+        raise ValueError(f"--out must be a file, {path!r} is a folder")
+    folder = Path(path).resolve()
+    while not folder.exists():
+        folder = folder.parent
+    if not os.access(folder, os.W_OK) or (folder.is_file() and folder != Path(path).resolve()):
+        raise ValueError(f"--out {path!r} cannot be written")
+    if not suffixes and folder.is_file():
+        raise ValueError(f"--out must be a folder, {path!r} is a file")
+    Path(path).resolve().parent.mkdir(parents=True, exist_ok=True)
 
 
 # -- output --------------------------------------------------------------------------------------
@@ -312,11 +321,12 @@ def flight_text(flight: Any) -> str:
     )
 
 
-def _write(out: str, problem: Any, plan: Any, states: Any) -> None:
-    """Writes a plan as JSON or, with planned and proposed path, as a picture."""
-    _require_suffix(out, (".json", ".png"))
+def _write(out: str, problem: Any, plan: Any) -> None:
+    """Writes a plan as JSON, or a picture of it."""
+    trajectory = plan.trajectory
+    states = None if trajectory is None else trajectory.states
     if out.endswith(".json"):
-        controls = None if states is None else plan.result.trajectory.controls.tolist()
+        controls = None if trajectory is None else trajectory.controls.tolist()
         data = {"problem": problem.to_dict(), **_plan_summary(plan)}
         data |= {"states": None if states is None else states.tolist(), "controls": controls}
         Path(out).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
@@ -335,13 +345,23 @@ def _write(out: str, problem: Any, plan: Any, states: Any) -> None:
 
 
 def _print(options: argparse.Namespace, data: dict[str, Any], text: str) -> None:
-    print(json.dumps(data) if options.json else text)
+    from art_policy.evaluate import finite
+
+    print(json.dumps(finite(data), allow_nan=False) if options.json else text)
 
 
 # -- options -------------------------------------------------------------------------------------
 
 
+def _at_least_one(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, got {value}")
+    return value
+
+
 def _parser() -> argparse.ArgumentParser:
+    count = _at_least_one
     parser = argparse.ArgumentParser(
         prog="freeflyer", description="Learned warm starts for a free-flying spacecraft robot."
     )
@@ -367,13 +387,13 @@ def _parser() -> argparse.ArgumentParser:
         sub.add_argument("--goal", type=float, nargs=3, metavar=("X", "Y", "PSI"), help="m, m, rad")
         sub.add_argument("--problem", help="JSON file with start, goal, obstacles, final_time")
         sub.add_argument("--model", default=DEFAULT_MODEL, help="model, or 'rel' for none")
-        sub.add_argument("--candidates", type=int, default=1, help="proposals that are refined")
+        sub.add_argument("--candidates", type=count, default=1, help="proposals that are refined")
         sub.add_argument("--out", help="plan: .json or .png; fly: .gif")
 
     sub = command("generate", _generate, "Make a Minari dataset from a recipe; resumes.")
     sub.add_argument("recipe", help="a recipe's name or TOML file")
-    sub.add_argument("--problems", type=int, help="how many problems (default: the recipe's)")
-    sub.add_argument("--workers", type=int, help="processes (default: one per processor)")
+    sub.add_argument("--problems", type=count, help="how many problems (default: the recipe's)")
+    sub.add_argument("--workers", type=count, help="processes (default: one per processor)")
     sub.add_argument("--out", help="Minari data root (default: Minari's own)")
     sub.add_argument("--force", action="store_true", help="replace a dataset of the same id")
 
@@ -382,18 +402,18 @@ def _parser() -> argparse.ArgumentParser:
     heads = ("multi_hypothesis", "autoregressive", "autoregressive_small")
     sub.add_argument("--head", choices=heads, default=heads[0])
     sub.add_argument("--minutes", type=float, help="length of the training")
-    sub.add_argument("--steps", type=int, help="length of the training in optimiser steps")
+    sub.add_argument("--steps", type=count, help="length of the training in optimiser steps")
     sub.add_argument("--out", required=True, help="folder of the model")
     sub.add_argument("--model-config", help="JSON with fields of ARTConfig")
     sub.add_argument("--train-config", help="JSON with fields of TrainConfig")
 
     sub = command("evaluate", _evaluate, "Compare warm starts on problems never trained on.")
     sub.add_argument("model", help="a shipped model's name, a folder, a Hugging Face id")
-    sub.add_argument("--problems", type=int, default=300)
+    sub.add_argument("--problems", type=count, default=300)
     sub.add_argument("--scenes", default="held-out", help="'held-out', 'random' or a scene's name")
     sub.add_argument("--final-time", type=float, nargs="+", default=[40.0], help="in s")
-    sub.add_argument("--candidates", type=int, default=4, help="most candidates refined")
-    sub.add_argument("--workers", type=int)
+    sub.add_argument("--candidates", type=count, default=4, help="most candidates refined")
+    sub.add_argument("--workers", type=count)
     sub.add_argument("--out", help="JSON file for the report")
 
     sub = command("render", _render, "Draw an episode of a dataset.")

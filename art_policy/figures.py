@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from freeflyer_env.planning import solve_rel
 from freeflyer_env.scenario import Problem
@@ -35,7 +36,12 @@ def plan_and_flight(problem: Problem, plan: Plan, flight: Flight, path: str | Pa
     rel = solve_rel(problem).trajectory
     if rel is not None:
         table.plot(*rel.states[:, :2].T, color="0.6", lw=1.2, ls=":", label="REL")
-    table.plot(*plan.warm_start.states[:, :2].T, color="tab:orange", lw=1.4, label="ART proposes")
+    table.plot(
+        *plan.warm_start.states[:, :2].T,
+        color="tab:orange",
+        lw=1.4,
+        label=f"{plan.source.upper()} proposes",
+    )
     table.plot(*trajectory.states[:, :2].T, "--", color="tab:blue", lw=2.2, label="SCP plans")
     table.plot(*flight.states[:, :2].T, color="black", lw=1.2, label="PID flies")
     table.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=4, frameon=False)
@@ -55,6 +61,45 @@ def plan_and_flight(problem: Problem, plan: Plan, flight: Flight, path: str | Pa
     velocity.grid(alpha=0.3)
     velocity.legend(frameon=False)
     figure.savefig(path, dpi=110)
+
+
+def fly_and_film(
+    problem: Problem, plan: Plan, film: bool = True, every: int = 4
+) -> tuple[Flight, list[NDArray[np.uint8]]]:
+    """Flies a solved plan under PID with the thrusters in ``FreeFlyer-v0``.
+
+    Args:
+        problem: What was planned.
+        plan: A solved plan.
+        film: Whether to draw frames.
+        every: Control periods of 0.1 s between frames.
+
+    Returns:
+        The flight, and its frames ``(H, W, 3)``.
+    """
+    import gymnasium as gym
+
+    from freeflyer_env.control import fly
+
+    if plan.trajectory is None:
+        raise ValueError("There is no plan to fly.")
+    env = gym.make(
+        "freeflyer_env:FreeFlyer-v0",
+        action_mode="thrusters",
+        scenario=problem.scenario,
+        terminate_early=False,
+        render_mode="rgb_array" if film else None,
+    )
+    env.reset(options={"problem": problem})
+    base: Any = env.unwrapped
+    base.set_plan(plan.trajectory.states)
+    frames: list[Any] = [env.render()] if film else []
+
+    def draw() -> None:
+        if film and round(base.time / base.control_dt) % every == 0:
+            frames.append(env.render())
+
+    return fly(env, plan.trajectory, on_step=draw), frames
 
 
 def _draw_table(axes: Any, problem: Problem) -> None:

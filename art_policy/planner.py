@@ -67,7 +67,7 @@ class Plan:
         warm_start: The reference that SCP started from.
         source: ``"art"`` or ``"rel"``: where the chosen warm start came from.
         timings: Wall times in s: ``propose``, ``rel``, ``scp`` and ``total``.
-        iterations: Subproblems solved in all, REL's not counted.
+        iterations: Subproblems solved by all refinements; those of REL itself are not counted.
         monitor: What the monitor distrusted or had to replace, one line each; empty if nothing.
     """
 
@@ -113,7 +113,11 @@ class WarmStartPlanner:
         if self.model is not None:
             self._try_model(search)
         role = "portfolio" if self.model is None else self.config.rel
-        if role == "portfolio" or (role == "fallback" and not search.any_solved):
+        if (
+            not search.attempts
+            or role == "portfolio"
+            or (role == "fallback" and not search.any_solved)
+        ):
             search.refine_rel()
         return search.finish()
 
@@ -125,7 +129,6 @@ class WarmStartPlanner:
         rel = search.solve_rel().trajectory if needs_rel else None
         if needs_rel and rel is None:
             search.monitor.append("REL failed, so there is no reward-to-go to ask the model for")
-            search.refine_rel()
             return
         began = time.perf_counter()
         proposals = propose(self.model, search.problem, self.config.n_candidates, rel=rel)

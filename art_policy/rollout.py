@@ -31,7 +31,8 @@ class Proposal:
     Attributes:
         trajectory: The warm start; it has the problem's number of steps.
         score: The model's opinion, higher is better: the log-probability of leading to the best
-            optimum (multi-hypothesis), or minus the cost in m/s (autoregressive).
+            optimum (multi-hypothesis), or minus violating nodes and miss of the goal
+            (autoregressive).
     """
 
     trajectory: Trajectory

@@ -131,7 +131,7 @@ class _State:
     seconds: float = 0.0
 
     @classmethod
-    def create(cls, model_config: ARTConfig, config: TrainConfig) -> _State:
+    def create(cls, model_config: ARTConfig, config: TrainConfig, data: dict[str, Any]) -> _State:
         torch.manual_seed(config.seed)
         model = ART(model_config).to(config.device)
         matrices = [p for p in model.parameters() if p.dim() >= 2]
@@ -143,7 +143,11 @@ class _State:
         rate = config.learning_rate
         optimizer = torch.optim.AdamW(groups, lr=rate, betas=(0.9, 0.98), fused=True)
         average = [p.detach().clone() for p in model.parameters()]
-        settings = {"model": model_config.to_dict(), "train": dataclasses.asdict(config)}
+        settings = {
+            "model": model_config.to_dict(),
+            "train": dataclasses.asdict(config),
+            "data": data,
+        }
         compute_loss = torch.compile(model.net.loss) if config.compile else model.net.loss
         return cls(model, compute_loss, average, optimizer, settings)
 
@@ -163,8 +167,8 @@ class _State:
 
     def load(self, path: Path) -> None:
         content = torch.load(path, map_location=self.model.device, weights_only=True)
-        for kind in ("model", "train"):
-            ours, theirs = self.settings[kind], content["settings"][kind]
+        for kind in ("model", "train", "data"):
+            ours, theirs = self.settings[kind], content["settings"].get(kind, {})
             changed = sorted(k for k in ours.keys() | theirs.keys() if ours.get(k) != theirs.get(k))
             if changed := [name for name in changed if name not in _MAY_CHANGE]:
                 raise ValueError(
@@ -251,7 +255,8 @@ def train(
     )
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
-    state = _State.create(model_config, config)
+    data = {"dataset": dataset.dataset_id, "examples": len(training)}
+    state = _State.create(model_config, config, data)
     if isinstance(state.model.net, Autoregressive) and isinstance(training, SequenceSet):
         sample = training.batch(torch.arange(min(len(training), 2048)), torch.Generator())
         state.model.net.fit_scales(sample)

@@ -41,7 +41,7 @@ class JsonLines:
     def __init__(self, path: Path, step: int) -> None:
         self._path = path
         lines = path.read_text("utf-8").splitlines() if step and path.exists() else []
-        kept = [line for line in lines if json.loads(line)["step"] <= step]
+        kept = [line for line in lines if _is_whole(line) and json.loads(line)["step"] <= step]
         path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
 
     def write(self, **figures: Any) -> None:
@@ -49,6 +49,11 @@ class JsonLines:
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         logger.info(" ".join(f"{name}={value:.4g}" for name, value in row.items()))
+
+
+def _is_whole(line: str) -> bool:
+    """Whether a line was written to its end before the process was killed."""
+    return line.startswith("{") and line.endswith("}")
 
 
 def _plain(value: Any) -> float | int:

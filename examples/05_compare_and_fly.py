@@ -12,13 +12,10 @@ import time
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
-
 from art_policy import ART, WarmStartPlanner
 from art_policy.cli import DEFAULT_MODEL, flight_summary, flight_text
 from art_policy.evaluate import evaluate, evaluation_problems, markdown_table, report, save_report
-from art_policy.figures import plan_and_flight
-from freeflyer_env.control import fly
+from art_policy.figures import fly_and_film, plan_and_flight
 from freeflyer_env.planning import solve_rel
 from freeflyer_env.rendering import save_gif
 
@@ -57,23 +54,7 @@ def main() -> None:
 
     print("2. Flying one plan under PID with the eight thrusters ...")
     problem, plan = most_telling(model, problems)
-    env = gym.make(
-        "freeflyer_env:FreeFlyer-v0",
-        action_mode="thrusters",
-        scenario=problem.scenario,
-        terminate_early=False,
-        render_mode="rgb_array",
-    )
-    env.reset(options={"problem": problem})
-    base: Any = env.unwrapped
-    base.set_plan(plan.trajectory.states)
-    frames = [env.render()]
-
-    def draw() -> None:
-        if round(base.time / base.control_dt) % 4 == 0:
-            frames.append(env.render())
-
-    flight = fly(env, plan.trajectory, on_step=draw)
+    flight, frames = fly_and_film(problem, plan)
     print(f"   {flight_text(flight)}")
 
     print("3. Writing the pictures ...")

@@ -225,8 +225,12 @@ class Problem:
         missing = {"start", "goal", "obstacles", "final_time"} - set(data)
         if missing:
             raise ValueError(f"A problem needs {sorted(missing)} too; got {sorted(data)}.")
-        scenario = replace(scenario or Scenario(), obstacles=Obstacles.from_rows(data["obstacles"]))
-        return cls(scenario, data["start"], data["goal"], float(data["final_time"]))
+        try:
+            obstacles = Obstacles.from_rows(data["obstacles"])
+            scenario = replace(scenario or Scenario(), obstacles=obstacles)
+            return cls(scenario, data["start"], data["goal"], float(data["final_time"]))
+        except TypeError as error:
+            raise ValueError(f"A problem holds numbers and lists of numbers: {error}.") from None
 
 
 def unwrap_goal(start: FloatArray, goal: FloatArray) -> FloatArray:

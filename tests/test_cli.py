@@ -100,11 +100,23 @@ def test_info_lists_what_there_is(capsys):
         (["evaluate", "no-such-model"], "No model is called"),
         (["render", "freeflyer/nothing-v0", "--out", "x.mp4"], "must end in .gif or .png"),
         (["info", "no-such-model"], "No model is called"),
+        (["plan", "--problem", "list.json"], "must hold a JSON object"),
+        (["plan", "--problem", "null.json"], "numbers and lists of numbers"),
+        (["plan", "--problem", "null.json", "--goal", "3", "1", "0"], "leave out --goal"),
+        (["plan", "--problem", "list.json/x"], "list.json/x"),
+        (["plan", "--model", "rel", "--out", "list.json/plan.json"], "cannot be written"),
+        (["train", "x", "--out", "x", "--steps", "1", "--model-config", "{"], "--model-config"),
+        (["train", "x", "--out", "x", "--steps", "1", "--train-config", '{"lr": 1}'], "'lr'"),
+        (["train", "x", "--out", "list.json", "--steps", "1"], "must be a folder"),
     ],
 )
 def test_bad_input_is_one_line_and_exit_code_2(capsys, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    (tmp_path / "list.json").write_text("[1, 2]")
+    zeros = [0.2, 1.0, 0, 0, 0, 0]
+    problem = {"start": zeros, "goal": zeros, "obstacles": [], "final_time": None}
+    (tmp_path / "null.json").write_text(json.dumps(problem))
     assert main(arguments) == 2
     error = capsys.readouterr().err
     assert message in error
@@ -120,7 +132,8 @@ def test_a_start_inside_an_obstacle_is_named(capsys):
     assert "inside the keep-out zone of obstacle 0" in capsys.readouterr().err
 
 
-def test_wrong_options_exit_with_2():
+@pytest.mark.parametrize("value", ["many", "0", "-2"])
+def test_wrong_options_exit_with_2(value):
     with pytest.raises(SystemExit) as stop:
-        main(["plan", "--candidates", "many"])
+        main(["plan", "--candidates", value])
     assert stop.value.code == 2

@@ -85,7 +85,13 @@ def build(
     folder = Path(shards) if shards is not None else dataset_folder(f".shards/{recipe.id}")
     report = generate(recipe, folder, n_problems, workers, progress)
     logger.info("%s", report)
-    return export(folder, n_problems=report.n_problems, force=force, credits=credits)
+    return export(
+        folder,
+        n_problems=report.n_problems,
+        force=force,
+        credits=credits,
+        progress=progress,
+    )
 
 
 def export(

@@ -34,6 +34,8 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+_UNSOLVED = "the relaxed problem was not solved"
+
 #: Problems in a shard; the last shard of a run may have fewer.
 SHARD_SIZE = 100
 
@@ -156,7 +158,7 @@ def solve_problems(recipe: Recipe, first: int, count: int) -> Shard:
             logger.warning("problem %d of %s: %s", first + local, recipe.id, failures[local])
             continue
         if not records:
-            failures[local] = "the relaxed problem was not solved"
+            failures[local] = _UNSOLVED
             continue
         nodes = records[0]["trajectory"].states[:-1, :2]
         depth = keep_out_depth(problem.scenario, nodes)
@@ -251,7 +253,7 @@ def _make_shard(
     first = number * shard_size
     shard = solve_problems(recipe, first, count)
     failed = [first + int(local) for local in np.flatnonzero(shard.failure != "")]
-    if len(failed) == count:
+    if all(shard.failure != "") and not all(shard.failure == _UNSOLVED):
         raise RuntimeError(
             f"All {count} problems from {first} on failed, so the shard was not written. "
             f"The first one: {shard.failure[0]}"
