@@ -275,18 +275,6 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         """Shows the positions of the states ``(N, 6)`` as planned path; forgotten at reset."""
         self._plan = None if states is None else np.array(states, dtype=np.float64)[:, :2]
 
-    def __getstate__(self) -> dict[str, Any]:
-        data = self.__dict__.copy()
-        if self._world is not None:
-            data["_world"] = self._world.state
-        return data
-
-    def __setstate__(self, data: dict[str, Any]) -> None:
-        self.__dict__.update(data)
-        if self._world is not None:
-            self._world = self._make_world()
-            self._world.state = data["_world"]
-
     def _act(self, world: World, action: FloatArray) -> float:
         """Applies the action, advances the world, returns the effort in m/s."""
         robot, period = self.robot, self.control_dt

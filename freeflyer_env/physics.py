@@ -63,6 +63,10 @@ class World:
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {value}.")
         self.scenario = scenario
+        self._solid = solid
+        # Calls that lead here from a moment at which the state was all there is to know.
+        self._history: list[tuple[str, tuple[Any, ...]]] = []
+        self._steps_apart, self._touched = 0, False
         # Chipmunk multiplies the two shapes' values; the robot's are one.
         self._surface = (restitution, friction)
         self.contacts = ContactLog()
@@ -72,6 +76,8 @@ class World:
         # tolerated, and the rest of it is gone after one step.
         self._space.collision_slop = 1e-4
         self._space.collision_bias = 0.0
+        # The default tree reports pairs in an order that depends on where the robot has been.
+        self._space.use_spatial_hash(1.0, 100)
         robot = scenario.robot
         self._body = pymunk.Body(robot.mass, robot.inertia)
         self._shape = pymunk.Circle(self._body, robot.radius)
@@ -82,6 +88,12 @@ class World:
             self._add_obstacles()
             self._add_walls()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Chipmunk keeps contact impulses and push-out velocities that it neither shows nor takes
+        # back, so a copy made during a contact has to go through that contact again.
+        settings = (self.scenario, *self._surface, self._solid)
+        return _replayed, (settings, self._history, self.contacts)
+
     @property
     def state(self) -> FloatArray:
         """State ``(6,)`` of the robot, a fresh array."""
@@ -90,14 +102,13 @@ class World:
 
     @state.setter
     def state(self, value: FloatArray) -> None:
-        x = [float(item) for item in value]
-        self._body.position, self._body.angle = (x[0], x[1]), x[2]
-        self._body.velocity, self._body.angular_velocity = (x[3], x[4]), x[5]
-        self._space.reindex_shapes_for_body(self._body)
+        self._place([float(item) for item in value])
 
     def kick(self, velocity_change: FloatArray) -> None:
         """Changes ``(v_x, v_y, omega)`` at once, as an impulse does."""
-        self._kick(*(float(item) for item in velocity_change))
+        change = tuple(float(item) for item in velocity_change)
+        self._history.append(("kick", (change,)))
+        self._kick(*change)
 
     def advance(
         self, duration: float, sub_steps: int, wrenches_body: FloatArray | None = None
@@ -110,13 +121,38 @@ class World:
             wrenches_body: ``(sub_steps, 3)`` wrench ``(F_x, F_y, M)`` in N, N, N m, body frame,
                 of each sub-step; None lets the robot drift.
         """
-        h = duration / sub_steps
-        if wrenches_body is None:
+        wrenches = None if wrenches_body is None else wrenches_body.tolist()
+        self._advance(duration / sub_steps, sub_steps, wrenches)
+
+    def take_contacts(self) -> ContactLog:
+        """The contacts since the last call."""
+        log, self.contacts = self.contacts, ContactLog()
+        return log
+
+    def _place(self, x: list[float]) -> None:
+        self._history.append(("_place", (x,)))
+        self._body.position, self._body.angle = (x[0], x[1]), x[2]
+        self._body.velocity, self._body.angular_velocity = (x[3], x[4]), x[5]
+        self._space.reindex_shapes_for_body(self._body)
+
+    def _advance(self, h: float, sub_steps: int, wrenches: list[list[float]] | None) -> None:
+        self._history.append(("_advance", (h, sub_steps, wrenches)))
+        self._steps_apart += sub_steps
+        self._touched = False
+        if wrenches is None:
             for _ in range(sub_steps):
                 self._space.step(h)
-            return
+        else:
+            self._push(h, wrenches)
+        if self._touched:
+            self._steps_apart = 0
+        elif self._steps_apart > self._space.collision_persistence:
+            self._history = [("_place", (self.state.tolist(),))]
+
+    def _push(self, h: float, wrenches: list[list[float]]) -> None:
+        """Steps of ``h`` seconds, one under each body wrench."""
         body, robot = self._body, self.scenario.robot
-        for fx, fy, torque in wrenches_body.tolist():
+        for fx, fy, torque in wrenches:
             alpha = torque / robot.inertia
             middle = body.angle + 0.5 * h * (body.angular_velocity + 0.25 * h * alpha)
             cos, sin, gain = math.cos(middle), math.sin(middle), 0.5 * h / robot.mass
@@ -124,11 +160,6 @@ class World:
             self._kick(*half)
             self._space.step(h)
             self._kick(*half)
-
-    def take_contacts(self) -> ContactLog:
-        """The contacts since the last call."""
-        log, self.contacts = self.contacts, ContactLog()
-        return log
 
     def _kick(self, dx: float, dy: float, turn: float) -> None:
         body = self._body
@@ -165,9 +196,22 @@ class World:
         )
 
     def _began(self, _arbiter: pymunk.Arbiter, _space: pymunk.Space, name: int | str) -> None:
+        self._touched = True
         self.contacts.count += 1
         self.contacts.bodies.add(name)
 
     def _solved(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, name: int | str) -> None:
+        self._touched = True
         self.contacts.impulse += float(arbiter.total_impulse.length)
         self.contacts.bodies.add(name)
+
+
+def _replayed(
+    settings: tuple[Any, ...], history: list[tuple[str, tuple[Any, ...]]], contacts: ContactLog
+) -> World:
+    """A new world in which the calls of ``history`` were made again."""
+    world = World(*settings)
+    for name, arguments in history:
+        getattr(world, name)(*arguments)
+    world.contacts = contacts
+    return world

@@ -158,6 +158,29 @@ def test_copies_go_on_identically(clone, mode):
     np.testing.assert_array_equal(env.reset()[0]["goal"], twin.reset()[0]["goal"])
 
 
+@pytest.mark.parametrize("clone", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
+@pytest.mark.parametrize("sub_steps", [1, 10])
+@pytest.mark.parametrize(
+    ("restitution", "friction"), [(0.0, 0.5), (1.0, 0.0)], ids=["plastic", "elastic"]
+)
+def test_copies_made_during_a_contact_go_on_identically(clone, sub_steps, restitution, friction):
+    """Chipmunk's contacts hold more than the state: an impulse cache, a push-out velocity."""
+    surface = {"restitution": restitution, "friction": friction}
+    env = make(scenario=[[2.0, 1.2, 0.2]], sub_steps=sub_steps, **surface).unwrapped
+    into_the_corner = [0.3, 0.3, 0.2, -0.2, -0.15, 0.3]
+    env.reset(
+        options={"problem": Problem(env.scenario, into_the_corner, [3.2, 1.2, 0, 0, 0, 0], 40.0)}
+    )
+    action, touched = np.array([-0.012, -0.01, 0.0005], dtype=np.float32), 0
+    for _ in range(70):
+        twin = clone(env)
+        first, second = env.step(action), twin.step(action)
+        touched += bool(first[4]["contacts"]["with"])
+        np.testing.assert_array_equal(env.state, twin.state)
+        assert first[4]["contacts"] == second[4]["contacts"]
+    assert touched >= 3
+
+
 def test_problems_can_be_given_as_mappings_or_observations():
     problem = sample_problem(np.random.default_rng(7))
     env = make()

@@ -1,5 +1,7 @@
 """The pymunk world against closed forms."""
 
+import copy
+
 import numpy as np
 import pytest
 
@@ -88,6 +90,21 @@ def test_the_robot_stays_on_the_table():
         world.advance(0.5, 10)
         assert (world.state[:2] > ROBOT.radius - 5e-3).all()
         assert (world.state[:2] < np.array(EMPTY.table) - ROBOT.radius + 5e-3).all()
+
+
+@pytest.mark.parametrize("seed", [22, 42])
+def test_two_contacts_at_once_do_not_depend_on_the_way_there(seed):
+    """In a corner the order of the two contacts matters; these seeds tell when it varies."""
+    world, rng = World(EMPTY, restitution=0.5, friction=0.5), np.random.default_rng(seed)
+    world.state = [0.4, 0.4, 0.0, *rng.uniform(-0.3, 0.0, 2), 0.5]
+    for step in range(60):
+        kick = np.array([*rng.uniform(-0.12, 0.08, 2), rng.uniform(-0.3, 0.3)])
+        if step % 6 == 0:
+            twin = copy.deepcopy(world)
+        for each in (world, twin):
+            each.kick(kick)
+            each.advance(0.5, 10)
+        np.testing.assert_array_equal(world.state, twin.state)
 
 
 def test_without_contacts_it_passes_through():
