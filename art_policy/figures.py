@@ -60,7 +60,7 @@ def plan_and_flight(problem: Problem, plan: Plan, flight: Flight, path: str | Pa
     velocity.set(xlabel="time in s", ylabel="velocity in cm/s")
     velocity.grid(alpha=0.3)
     velocity.legend(frameon=False)
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, bbox_inches="tight")
 
 
 def fly_and_film(
