@@ -7,14 +7,25 @@ for machines on standard output.
 from __future__ import annotations
 
 import argparse
-import json
 import logging
-import math
 import os
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
+
+from art_policy.cli_io import (
+    check_out,
+    configure,
+    flight_summary,
+    flight_text,
+    plan_summary,
+    plan_text,
+    planner_of,
+    print_result,
+    problem_of,
+    write_plan,
+)
 
 DEFAULT_MODEL = "art-scene-random"
 
@@ -41,32 +52,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _plan(options: argparse.Namespace) -> None:
-    _check_out(options.out, (".json", ".png"))
-    problem = _problem(options)
-    plan = _planner(options).plan(problem)
-    summary = {"problem": problem.to_dict(), **_plan_summary(plan)}
+    check_out(options.out, (".json", ".png"))
+    problem = problem_of(options)
+    plan = planner_of(options).plan(problem)
+    summary = {"problem": problem.to_dict(), **plan_summary(plan)}
     if options.out:
-        _write(options.out, problem, plan)
+        write_plan(options.out, problem, plan)
         summary["out"] = str(options.out)
-    _print(options, summary, _plan_text(plan))
+    print_result(options, summary, plan_text(plan))
 
 
 def _fly(options: argparse.Namespace) -> None:
     from art_policy.figures import fly_and_film
 
-    _check_out(options.out, (".gif",))
-    problem = _problem(options)
-    plan = _planner(options).plan(problem)
+    check_out(options.out, (".gif",))
+    problem = problem_of(options)
+    plan = planner_of(options).plan(problem)
     if plan.trajectory is None:
         raise ValueError(f"there is no plan to fly: {plan.result.message}")
     flight, frames = fly_and_film(problem, plan, film=bool(options.out))
-    summary = {**_plan_summary(plan), "flight": flight_summary(flight)}
+    summary = {**plan_summary(plan), "flight": flight_summary(flight)}
     if options.out:
         from freeflyer_env.rendering import save_gif
 
         save_gif(frames, options.out, fps=10)
         summary["out"] = str(options.out)
-    _print(options, summary, f"{_plan_text(plan)}\n{flight_text(flight)}")
+    print_result(options, summary, f"{plan_text(plan)}\n{flight_text(flight)}")
 
 
 def _generate(options: argparse.Namespace) -> None:
@@ -86,7 +97,7 @@ def _generate(options: argparse.Namespace) -> None:
     text = f"made {dataset}{where}; load it with minari.load_dataset({dataset!r})"
     if options.out:
         text += f" and MINARI_DATASETS_PATH={options.out}"
-    _print(options, {"dataset": dataset, "out": options.out}, text)
+    print_result(options, {"dataset": dataset, "out": options.out}, text)
 
 
 def _train(options: argparse.Namespace) -> None:
@@ -99,10 +110,10 @@ def _train(options: argparse.Namespace) -> None:
         "autoregressive": ARTConfig.paper,
         "autoregressive_small": ARTConfig.small,
     }
-    model_config = _configure(presets[options.head], "--model-config", options.model_config)
+    model_config = configure(presets[options.head], "--model-config", options.model_config)
     length = {"max_minutes": options.minutes, "max_steps": options.steps, "seed": options.seed}
-    config = _configure(TrainConfig, "--train-config", options.train_config, **length)
-    _check_out(options.out, ())
+    config = configure(TrainConfig, "--train-config", options.train_config, **length)
+    check_out(options.out, ())
     if Path(options.dataset).is_dir():
         folder = Path(options.dataset)
         is_packed = (folder / "meta.json").is_file()
@@ -111,7 +122,7 @@ def _train(options: argparse.Namespace) -> None:
         dataset = PackedDataset.from_minari(options.dataset)
     model = train(dataset, model_config, config, options.out)
     text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
-    _print(
+    print_result(
         options,
         {"out": options.out, "parameters": model.num_parameters, "problems": dataset.n_problems},
         f"{text} {options.out}",
@@ -129,7 +140,7 @@ def _evaluate(options: argparse.Namespace) -> None:
     from art_policy.model import ART
 
     ART.from_pretrained(options.model)  # a wrong name is an error before the work begins
-    _check_out(options.out, (".json",))
+    check_out(options.out, (".json",))
     problems = evaluation_problems(
         options.problems, options.scenes, options.final_time, options.seed
     )
@@ -144,7 +155,7 @@ def _evaluate(options: argparse.Namespace) -> None:
         f"{name} ({group_size(group)} problems)\n\n{markdown_table(group)}"
         for name, group in data["groups"].items()
     )
-    _print(options, summary, text)
+    print_result(options, summary, text)
 
 
 def group_size(group: dict[str, dict[str, float]]) -> int:
@@ -158,7 +169,7 @@ def _render(options: argparse.Namespace) -> None:
     from freeflyer_env import Problem
     from freeflyer_env.rendering import draw_scene, save_gif
 
-    _check_out(options.out, (".gif", ".png"))
+    check_out(options.out, (".gif", ".png"))
     dataset = minari.load_dataset(options.dataset)
     if not 0 <= options.episode < dataset.total_episodes:
         raise ValueError(
@@ -184,7 +195,7 @@ def _render(options: argparse.Namespace) -> None:
         Image.fromarray(frame(len(states) - 1)).save(options.out)
     else:
         save_gif([frame(i) for i in range(len(states))], options.out, fps=10)
-    _print(options, {"out": options.out}, f"wrote {options.out}")
+    print_result(options, {"out": options.out}, f"wrote {options.out}")
 
 
 def _info(options: argparse.Namespace) -> None:
@@ -207,147 +218,7 @@ def _info(options: argparse.Namespace) -> None:
             "parameters": model.num_parameters,
             "config": model.config.to_dict(),
         }
-    _print(options, data, "\n".join(f"{key}: {value}" for key, value in data.items()))
-
-
-# -- input ---------------------------------------------------------------------------------------
-
-
-def _problem(options: argparse.Namespace) -> Any:
-    """The problem that the options describe; raises ``ValueError`` if it is invalid."""
-    import numpy as np
-
-    from freeflyer_env import Problem, Scenario, sample_problem, unwrap_goal
-
-    if options.problem:
-        if clash := options.given & {"--scene", "--final-time", "--start", "--goal"}:
-            raise ValueError(f"--problem says it all; leave out {', '.join(sorted(clash))}")
-        data = json.loads(Path(options.problem).read_text(encoding="utf-8"))
-        if not isinstance(data, dict):
-            raise ValueError(f"{options.problem} must hold a JSON object with start, goal, ...")
-        return Problem.from_dict(data.get("problem", data)).require_valid()
-    scenario = None if options.scene == "random" else Scenario.named(options.scene)
-    rng = np.random.default_rng(options.seed)
-    problem = sample_problem(rng, scenario, options.final_time)
-    start, goal = problem.start, problem.goal
-    if options.start:
-        start = np.array([*options.start, 0.0, 0.0, 0.0])
-    if options.goal:
-        goal = np.array([*options.goal, 0.0, 0.0, 0.0])
-    if options.start or options.goal:
-        goal = unwrap_goal(start, goal)
-        problem = Problem(problem.scenario, start, goal, problem.final_time)
-    return problem.require_valid()
-
-
-def _planner(options: argparse.Namespace) -> Any:
-    from art_policy.model import ART
-    from art_policy.planner import PlannerConfig, WarmStartPlanner
-
-    model = None if options.model == "rel" else ART.from_pretrained(options.model)
-    return WarmStartPlanner(model, PlannerConfig(n_candidates=options.candidates))
-
-
-def _configure(make: Callable[..., Any], option: str, text: str | None, **values: Any) -> Any:
-    """Makes a configuration from the JSON of an option; any mistake in it is a ``ValueError``."""
-    try:
-        changes = json.loads(text or "{}")
-        return make(**{**values, **changes})
-    except (TypeError, AttributeError, json.JSONDecodeError) as error:
-        raise ValueError(f"{option} must be a JSON object of settings: {error}") from None
-
-
-def _check_out(path: str | None, suffixes: tuple[str, ...]) -> None:
-    """Refuses an output file that cannot be written before the work, not after it."""
-    if path is None:
-        return
-    if suffixes and Path(path).suffix not in suffixes:
-        raise ValueError(f"--out must end in {' or '.join(suffixes)}, got {path!r}")
-    if suffixes and Path(path).is_dir():
-        raise ValueError(f"--out must be a file, {path!r} is a folder")
-    folder = Path(path).resolve()
-    while not folder.exists():
-        folder = folder.parent
-    if not os.access(folder, os.W_OK) or (folder.is_file() and folder != Path(path).resolve()):
-        raise ValueError(f"--out {path!r} cannot be written")
-    if not suffixes and folder.is_file():
-        raise ValueError(f"--out must be a folder, {path!r} is a file")
-    Path(path).resolve().parent.mkdir(parents=True, exist_ok=True)
-
-
-# -- output --------------------------------------------------------------------------------------
-
-
-def _plan_summary(plan: Any) -> dict[str, Any]:
-    return {
-        "status": plan.result.status.value,
-        "cost": plan.result.cost if plan.result.solved else None,
-        "iterations": plan.iterations,
-        "source": plan.source,
-        "timings_ms": {name: 1e3 * value for name, value in plan.timings.items()},
-        "monitor": list(plan.monitor),
-    }
-
-
-def _plan_text(plan: Any) -> str:
-    lines = [f"{plan.result.status.value}: {plan.result.message}"]
-    if plan.result.solved:
-        lines.append(
-            f"cost {plan.result.cost:.4f} m/s, warm start from {plan.source.upper()}, "
-            f"{plan.iterations} iterations, {1e3 * plan.timings['total']:.0f} ms"
-        )
-    return "\n".join([*lines, *(f"monitor: {line}" for line in plan.monitor)])
-
-
-def flight_summary(flight: Any) -> dict[str, Any]:
-    """Figures of a flight for JSON."""
-    return {
-        "success": flight.success,
-        "final_position_error_m": flight.final_error[0],
-        "final_heading_error_rad": flight.final_error[1],
-        "tracking_error_m": flight.tracking_error,
-        "firing_time_s": flight.firing_time,
-        "contacts": flight.contacts,
-    }
-
-
-def flight_text(flight: Any) -> str:
-    """One line about a flight."""
-    return (
-        f"flown under PID: {'success' if flight.success else 'goal missed'}, "
-        f"{1e3 * flight.final_error[0]:.1f} mm and {math.degrees(flight.final_error[1]):.2f} deg "
-        f"from the goal, tracking within {1e3 * flight.tracking_error:.1f} mm, "
-        f"{flight.firing_time:.1f} s of firing, {flight.contacts} contacts"
-    )
-
-
-def _write(out: str, problem: Any, plan: Any) -> None:
-    """Writes a plan as JSON, or a picture of it."""
-    trajectory = plan.trajectory
-    states = None if trajectory is None else trajectory.states
-    if out.endswith(".json"):
-        controls = None if trajectory is None else trajectory.controls.tolist()
-        data = {"problem": problem.to_dict(), **_plan_summary(plan)}
-        data |= {"states": None if states is None else states.tolist(), "controls": controls}
-        Path(out).write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
-        return
-    from PIL import Image
-
-    from freeflyer_env.rendering import draw_scene
-
-    picture = draw_scene(
-        problem.scenario,
-        problem.start[:3],
-        goal=problem.goal[:3],
-        planned=None if states is None else states[:, :2],
-    )
-    Image.fromarray(picture).save(out)
-
-
-def _print(options: argparse.Namespace, data: dict[str, Any], text: str) -> None:
-    from art_policy.evaluate import finite
-
-    print(json.dumps(finite(data), allow_nan=False) if options.json else text)
+    print_result(options, data, "\n".join(f"{key}: {value}" for key, value in data.items()))
 
 
 # -- options -------------------------------------------------------------------------------------
