@@ -15,7 +15,7 @@ def problem_of(options: argparse.Namespace) -> Any:
     """The problem that the options describe; raises ``ValueError`` if it is invalid."""
     import numpy as np
 
-    from freeflyer_env import Problem, Scenario, unwrap_goal
+    from freeflyer_env import Problem, Scenario, sample_problem, unwrap_goal
 
     if options.problem:
         if clash := options.given & {"--scene", "--final-time", "--start", "--goal"}:
