@@ -330,6 +330,8 @@ def _placed(points: Any, pose: FloatArray) -> FloatArray:
 
 def _thinned(points: FloatArray) -> FloatArray:
     """Pixels ``(K, 2)`` without those too close to the one before to be seen apart."""
+    if not len(points):
+        return points
     kept = [0]
     for index, point in enumerate(points):
         if np.hypot(*(point - points[kept[-1]])) >= _SUPERSAMPLING:

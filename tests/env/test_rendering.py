@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from freeflyer_env import Scenario
+from freeflyer_env import Obstacles, Scenario
 from freeflyer_env.rendering import draw_scene, save_gif
 
 SCENE = Scenario.named("nominal")
@@ -113,3 +113,9 @@ def test_a_missing_package_is_named_with_its_remedy(module, use, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(gym.error.DependencyNotInstalled, match=r"freeflyer-gym\[render\]"):
         use()
+
+
+def test_an_empty_table_and_empty_paths_can_be_drawn():
+    empty = Scenario(Obstacles.from_rows([]))
+    picture = draw_scene(empty, (1.0, 1.0, 0.0), planned=np.zeros((0, 2)), flown=np.zeros((0, 2)))
+    assert picture.dtype == np.uint8
