@@ -1,6 +1,6 @@
 """The constraints of the optimal control problem, checked on a trajectory.
 
-This is the one check that the planner, the datasets, the environment and the evaluation share. It
+This is the one check that the planner, the datasets and the evaluation share. It
 works from the states and controls alone and shares no code with the solver.
 """
 
@@ -68,8 +68,17 @@ def actuation_excess(scenario: Scenario, psi: FloatArray, controls: FloatArray) 
 
 
 def check(problem: Problem, states: FloatArray, controls: FloatArray) -> ConstraintReport:
-    """Checks states ``(N + 1, 6)`` and controls ``(N, 3)`` against every constraint."""
+    """Checks states ``(N + 1, 6)`` and controls ``(N, 3)`` against every constraint.
+
+    Raises:
+        ValueError: If the trajectory has another number of steps than the problem.
+    """
     scenario = problem.scenario
+    if len(controls) != problem.n_steps or len(states) != problem.n_steps + 1:
+        raise ValueError(
+            f"The problem has {problem.n_steps} steps, the trajectory {len(controls)} controls and "
+            f"{len(states)} states."
+        )
     residual = dynamics_residual(states, controls, scenario.dt, scenario.robot)
     return ConstraintReport(
         dynamics=float(np.abs(residual).max()),
@@ -92,12 +101,12 @@ def violations(
     """The indicator ``C(t_i)`` of the paper's eq. 6 at the ``N`` nodes, ``(N,)`` of 0 or 1.
 
     A node violates if its state is off the table or inside a keep-out disc, or its control exceeds
-    the actuation limit, by more than ``tolerance``.
+    the actuation limit, by more than ``tolerance``, or is not a number.
     """
     nodes = np.asarray(states)[:-1]
     excess = np.maximum(_off_table(scenario, nodes), keep_out_depth(scenario, nodes[:, :2]))
     excess = np.maximum(excess, actuation_excess(scenario, nodes[:, 2], controls))
-    return (excess > tolerance).astype(np.float64)
+    return (~(excess <= tolerance)).astype(np.float64)
 
 
 def _off_table(scenario: Scenario, states: FloatArray) -> FloatArray:

@@ -63,12 +63,13 @@ def reference_at(trajectory: Trajectory, time: float) -> tuple[FloatArray, Float
 
     Args:
         trajectory: The plan.
-        time: In s, from 0; beyond the end the plan's last state is held.
+        time: In s; before 0 the plan's first state is held, beyond the end its last.
 
     Returns:
         State ``(6,)`` and acceleration ``(3,)`` (m/s^2, m/s^2, rad/s^2).
     """
     dt, n = trajectory.dt, trajectory.n_steps
+    time = max(time, 0.0)
     index = int(np.floor(time / dt + 1e-9))
     if index >= n:
         return trajectory.states[-1].copy(), np.zeros(3)

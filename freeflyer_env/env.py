@@ -46,7 +46,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
 
     It is the free-flyer testbed of Celestini et al., "Generalizable Spacecraft Trajectory
     Generation via Multimodal Learning with Transformers": mass 16 kg, inertia 0.18 kg m^2, radius
-    0.15 m, thrust 0.2 N, table 3.5 m x 2.5 m. Contacts are real (pymunk); free flight is exact. The
+    0.15 m, thrust 0.2 N, table 3.5 m x 2.5 m. Contacts are real (pymunk); drift is exact. The
     thrusters are drawn in :mod:`freeflyer_env.robot`.
 
     ## Action Space
@@ -113,8 +113,10 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     * `success_reward`: added to the reward on success.
     * `terminate_early`: whether success ends the episode before the final time.
     * `goal_tolerance`: `(position m, heading rad, speed m/s, rate rad/s)`.
-    * `sub_steps`: physics steps in a control step. Free flight does not depend on them; contacts
-      are found at their ends, after an overlap of up to one sub-step's motion (50 ms in `delta_v`).
+    * `sub_steps`: physics steps in a control step. In `delta_v` free flight does not depend on
+      them; under thrust that turns with the robot the error is of second order in their length,
+      and pulses are whole numbers of them. Contacts are found at their ends, after an overlap of
+      up to one sub-step's motion (50 ms in `delta_v`).
     * `max_obstacles`: rows of the `obstacles` observation; default: the scene's, at least 4.
     * `restitution`, `friction`: of all contacts.
     * `contacts`: `False` lets the robot pass through obstacles and walls, as in the optimal control
@@ -174,7 +176,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         self._world: World | None = None
         self._step_count = 0
         # A problem to show before the first reset, and an early error for arguments that are wrong.
-        self.problem = sample_problem(np.random.default_rng(0), base, self.final_time)
+        self.problem = self._sample_problem(np.random.default_rng(0))
         require_fit(self.problem, base, self.observation_space)
         self._make_world()
 
@@ -225,6 +227,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         self._modulator.reset()
         self._plan, self._duties = None, np.zeros(8)
         self._step_count, self._cost, self._firing_time = 0, 0.0, np.zeros(8)
+        self._ended = False
         self._n_steps = math.ceil(self.problem.final_time / self.control_dt - 1e-6)
         self._flown = [self.problem.start[:2]]
         state = self._world.state
@@ -241,6 +244,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
                 f"An action of mode {self.action_mode!r} must be {self.action_space.shape} finite "
                 f"numbers, got {action.tolist()}."
             )
+        if self._ended:
+            gym.logger.warn("step() was called after the episode's end; call reset() first.")
         effort = self._act(world, action.astype(np.float64))
         self._cost += effort
         self._step_count += 1
@@ -250,7 +255,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         at_end = self._step_count >= self._n_steps
         terminated = bool(info["is_success"] and (at_end or self.terminate_early))
         truncated = not terminated and (at_end or self._off_table(state))
-        reward = -effort + (self.success_reward if terminated else 0.0)
+        reward = -effort + (self.success_reward if terminated and not self._ended else 0.0)
+        self._ended = self._ended or terminated or truncated
         return self._observation(state), reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
@@ -300,10 +306,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
 
     def _make_problem(self, given: Any) -> Problem:
         if given is None:
-            n_obstacles = min(self.max_obstacles, _MAX_OBSTACLES)
-            return sample_problem(
-                self.np_random, self._fixed_scenario, self.final_time, n_obstacles=n_obstacles
-            )
+            return self._sample_problem(self.np_random)
         if not isinstance(given, (Problem, Mapping)):
             raise ValueError(
                 f"A problem must be a Problem or a mapping, got {type(given).__name__}."
@@ -311,6 +314,10 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         problem = given if isinstance(given, Problem) else Problem.from_dict(given, self._base)
         require_fit(problem.require_valid(), self._base, self.observation_space)
         return problem
+
+    def _sample_problem(self, rng: np.random.Generator) -> Problem:
+        n_obstacles = min(self.max_obstacles, _MAX_OBSTACLES)
+        return sample_problem(rng, self._fixed_scenario, self.final_time, n_obstacles=n_obstacles)
 
     def _observation(self, state: FloatArray) -> dict[str, Any]:
         box: Any = self.observation_space["state"]

@@ -216,8 +216,8 @@ def _import_pygame() -> Any:
     return pygame
 
 
-@lru_cache(maxsize=8)
 def _font(size: int) -> Any:
+    """A fresh font: a kept one dies with ``pygame.quit()``, which other environments call."""
     return _import_pygame().font.Font(None, size)
 
 

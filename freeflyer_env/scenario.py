@@ -19,7 +19,7 @@ from freeflyer_env.robot import FloatArray, Robot
 #: Names of the six state components, in order.
 STATE_NAMES = ("r_x", "r_y", "psi", "v_x", "v_y", "omega")
 
-_ON_BOUNDARY = 1e-7  # m: float32 rounding of a start on the boundary is not a violation
+_ON_BOUNDARY = 2e-7  # m: float32 rounding of a start on the boundary is not a violation
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,6 +89,7 @@ class Scenario:
     keep_out_factor: float = 1.1
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "table", tuple(float(side) for side in self.table))
         if not all(np.isfinite(side) and side > 2 * self.robot.radius for side in self.table):
             raise ValueError(
                 f"Scenario.table must be wider than the robot (2 x {self.robot.radius} m) "
@@ -201,7 +202,7 @@ class Problem:
         return self
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers and lists, for JSON; :meth:`from_dict` is its inverse (default robot)."""
+        """Plain numbers and lists, for JSON; robot, table and step are not among them."""
         return {
             "start": self.start.tolist(),
             "goal": self.goal.tolist(),
@@ -219,7 +220,7 @@ class Problem:
             scenario: Supplies robot, table and step; its obstacles are replaced.
         """
         data = dict(data)
-        if "state" in data:
+        if "state" in data and "time_to_go" in data:
             data["start"] = data.pop("state")
             data["final_time"] = float(np.asarray(data.pop("time_to_go")).item())
         missing = {"start", "goal", "obstacles", "final_time"} - set(data)
@@ -296,6 +297,11 @@ def sample_problem(
         rows = _float32_exact(obstacles.rows())
         scenario = replace(base, obstacles=Obstacles.from_rows(rows))
     radius, (width, _) = scenario.robot.radius, scenario.table
+    if radius > 0.25 or width < 1.0:
+        raise ValueError(
+            "Random problems need room for start and goal: a robot radius of at most 0.25 m and a "
+            f"table at least 1 m long, got {radius} m and {width} m; give a problem instead."
+        )
     start = _sample_state_at_rest(rng, scenario, (radius, 0.5 - radius))
     goal = _sample_state_at_rest(rng, scenario, (width - 0.5 + radius, width - radius))
     goal = _float32_exact(unwrap_goal(start, goal))

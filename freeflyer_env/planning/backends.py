@@ -51,8 +51,12 @@ class PIQPBackend:
     """PIQP, a proximal interior-point method; one solver object, updated in place."""
 
     def __init__(self) -> None:
-        import piqp
-
+        try:
+            import piqp
+        except ImportError as error:
+            raise ModuleNotFoundError(
+                'Planning needs PIQP: pip install "freeflyer-gym[planning]".'
+            ) from error
         self._piqp = piqp
         self._solver = piqp.SparseSolver()
         self._solver.settings.max_iter = 100
@@ -74,7 +78,7 @@ class PIQPBackend:
         status = self._solver.solve()
         if status == self._piqp.PIQP_SOLVED:
             return SolverStatus.SOLVED, self._solver.result.x
-        if status in (self._piqp.PIQP_PRIMAL_INFEASIBLE, self._piqp.PIQP_DUAL_INFEASIBLE):
+        if status == self._piqp.PIQP_PRIMAL_INFEASIBLE:
             return SolverStatus.INFEASIBLE, self._solver.result.x
         # Rare, and mostly a program that is infeasible by a hair: the simplex method decides.
         return HiGHSBackend().solve(program)

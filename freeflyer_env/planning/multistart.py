@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from freeflyer_env.constraints import keep_out_depth
-from freeflyer_env.planning.scp import SCPConfig, SCPResult, solve_rel, solve_scp
+from freeflyer_env.planning.scp import SCPConfig, SCPResult, solve_rel, solve_scp, straight_line
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem, Scenario
@@ -64,8 +64,8 @@ def solve_multistart(
     if n_starts < 1:
         raise ValueError(f"n_starts must be at least 1, got {n_starts}.")
     rel = solve_rel(problem, config)
-    if rel.trajectory is None:
-        return MultistartResult(rel, (rel,), ())
+    if rel.trajectory is None or problem.defects():
+        return MultistartResult(rel, (solve_scp(problem, straight_line(problem), config),), ())
     starts = [rel.trajectory]
     if n_starts > 1:
         starts += homotopy_starts(problem, n_starts - 1)
@@ -189,6 +189,8 @@ def _trapezoid(n: int, ramp: float = 0.15) -> FloatArray:
     """Share of the way ``(n,)`` under a trapezoidal speed profile with ramps of share ``ramp``."""
     t = np.linspace(0.0, 1.0, n)
     speed = np.minimum(1.0, np.minimum(t, 1.0 - t) / ramp)
+    if n == 2:
+        return t
     way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
     return way / way[-1]
 

@@ -11,7 +11,7 @@ import enum
 import threading
 import time
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from freeflyer_env.constraints import check as check_constraints
 from freeflyer_env.planning.backends import BACKENDS, SolverStatus, make_backend
 from freeflyer_env.planning.subproblem import Subproblem
 from freeflyer_env.planning.trajectory import Trajectory
-from freeflyer_env.scenario import Problem
+from freeflyer_env.scenario import Obstacles, Problem
 
 
 class SCPStatus(enum.Enum):
@@ -39,7 +39,7 @@ class SCPStatus(enum.Enum):
 
 
 _REMEDIES = {
-    SCPStatus.SOLVED: "Converged, and every constraint was verified independently.",
+    SCPStatus.SOLVED: "Converged, and every constraint imposed was verified independently.",
     SCPStatus.ITERATION_LIMIT: (
         "Not converged within the iteration limit; raise SCPConfig.max_iterations or try another "
         "warm start."
@@ -147,6 +147,15 @@ def solve_rel(problem: Problem, config: SCPConfig | None = None) -> SCPResult:
     Its cost is the paper's lower bound of the optimal cost and its trajectory the classical warm
     start.
     """
+    began = time.perf_counter()
+    free = Problem(
+        replace(problem.scenario, obstacles=Obstacles.from_rows([])),
+        problem.start,
+        problem.goal,
+        problem.final_time,
+    )
+    if defects := free.defects():
+        return _failure(SCPStatus.INVALID_INPUT, began, detail="; ".join(defects))
     return _solve(problem, straight_line(problem), config or SCPConfig(), keep_out=False)
 
 
@@ -173,8 +182,11 @@ def solve_scp(
         if rel.trajectory is None:
             return rel
         warm_start = rel.trajectory
-    if warm_start.n_steps != problem.n_steps:
-        detail = f"the warm start has {warm_start.n_steps} steps, the problem {problem.n_steps}"
+    if (warm_start.n_steps, warm_start.dt) != (problem.n_steps, problem.scenario.dt):
+        detail = (
+            f"the warm start has {warm_start.n_steps} steps of {warm_start.dt} s, "
+            f"the problem {problem.n_steps} of {problem.scenario.dt} s"
+        )
         return _failure(SCPStatus.INVALID_INPUT, began, detail=detail)
     if not (np.isfinite(warm_start.states).all() and np.isfinite(warm_start.controls).all()):
         return _failure(SCPStatus.INVALID_INPUT, began, detail="the warm start is not finite")
@@ -197,7 +209,8 @@ def _solve(
     for iteration in range(config.max_iterations):
         trust_region = config.trust_region(iteration)
         solution = subproblem.solve(problem, reference, trust_region)
-        if solution.trajectory is None and soften:
+        softened = solution.trajectory is None and soften
+        if softened:
             elastic = _subproblem(problem, keep_out, config.backend, elastic=True)
             solution = elastic.solve(problem, reference, trust_region)
         if solution.trajectory is None:
@@ -213,10 +226,14 @@ def _solve(
         reference = trajectory
         if iteration == 0 or moved > config.state_tolerance:
             continue
-        if abs(costs[-1] - costs[-2]) < config.cost_tolerance and _verified(
-            problem, trajectory, keep_out
-        ):
+        if abs(costs[-1] - costs[-2]) >= config.cost_tolerance:
+            continue
+        if _verified(problem, trajectory, keep_out):
             return _finish(problem, SCPStatus.SOLVED, trajectory, costs, iteration + 1, began)
+        if softened:
+            # Settled with slack left: more iterations would only pay for it again.
+            status = SCPStatus.INFEASIBLE_SUBPROBLEM
+            return _finish(problem, status, trajectory, costs, iteration + 1, began)
     return _finish(
         problem, SCPStatus.ITERATION_LIMIT, trajectory, costs, config.max_iterations, began
     )
@@ -225,7 +242,7 @@ def _solve(
 def _verified(problem: Problem, trajectory: Trajectory, keep_out: bool) -> bool:
     report = check_constraints(problem, trajectory.states, trajectory.controls)
     if not keep_out:
-        report = ConstraintReport(**{**vars(report), "keep_out": 0.0})
+        report = replace(report, keep_out=0.0)
     return report.satisfied(FEASIBILITY_TOLERANCE)
 
 

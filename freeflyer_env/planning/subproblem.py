@@ -110,7 +110,7 @@ class Subproblem:
                 and rad/s alike.
         """
         self._set_dynamics(problem)
-        self._set_actuation(reference)
+        self._set_actuation(problem, reference)
         self._set_keep_out(problem, reference)
         self._set_bounds(problem, reference, trust_region)
         if self.velocity_rows:
@@ -224,7 +224,7 @@ class Subproblem:
             )
         self._program.b[:] = (b / (self.robot.control_gain * self._scale)).ravel()
 
-    def _set_actuation(self, reference: Trajectory) -> None:
+    def _set_actuation(self, problem: Problem, reference: Trajectory) -> None:
         psi, data = reference.states[:-1, 2], self._program.g.data
         cos, sin, n = np.cos(psi), np.sin(psi), self.n_steps
         rotation, slope = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
@@ -237,9 +237,10 @@ class Subproblem:
         data[self._slots["act_split"]] = np.concatenate([split, -split], axis=2).ravel()
         gradient = (unit @ slope @ reference.controls[:, :, None])[:, :, 0]
         data[self._slots["act_psi"]] = gradient[1:-1].ravel()
-        # At the two ends psi is given, and the linearisation moves to the right-hand side.
         shift = gradient * psi[:, None]
-        shift[0], shift[-1] = 0.0, 0.0
+        # At the two ends psi is given, and all of the linearisation is on the right-hand side.
+        shift[0] -= gradient[0] * problem.start[2]
+        shift[-1] -= gradient[-1] * problem.goal[2]
         self._program.h_lower[self._act_rows] = shift - 1.0
         self._program.h_upper[self._act_rows] = shift + 1.0
 

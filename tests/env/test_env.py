@@ -303,3 +303,29 @@ def test_the_picture_changes_with_the_plan():
     assert plain.ndim == 3
     env.unwrapped.set_plan(np.array([[0.5, 0.5, 0, 0, 0, 0], [3.0, 2.0, 0, 0, 0, 0]]))
     assert (env.render() != plain).any()
+
+
+def test_fewer_obstacles_than_usual():
+    observation, _ = make(max_obstacles=2).reset(seed=0)
+    assert observation["obstacles"].shape == (2, 3)
+    assert (observation["obstacles"][:, 2] > 0).all()
+
+
+def test_rendering_survives_another_environments_quit():
+    import pygame
+
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    before = env.render()
+    pygame.quit()
+    np.testing.assert_array_equal(env.render(), before)
+
+
+def test_success_is_paid_once():
+    problem = sample_problem(np.random.default_rng(0), n_obstacles=0)
+    there = Problem(problem.scenario, problem.goal, problem.goal, 5.0)
+    env = make().unwrapped
+    env.reset(options={"problem": there})
+    assert env.step(np.zeros(3))[1:3] == (1.0, True)
+    with pytest.warns(UserWarning, match="after the episode's end"):
+        assert env.step(np.zeros(3))[1] == 0.0

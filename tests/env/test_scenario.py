@@ -117,6 +117,9 @@ def test_each_family_of_constraints_is_checked():
     assert broken(4, 1, 2.45).table == pytest.approx(0.1)
     assert broken(4, 0, 1.9).keep_out == pytest.approx(0.385 - 0.1)
     assert broken(4, 0, np.nan).satisfied() is False
+    assert violations(scenario, np.full((11, 6), np.nan), controls).sum() == 10
+    with pytest.raises(ValueError, match="has 10 steps, the trajectory 4 controls"):
+        check(problem, states[:5], controls[:4])
     strong = controls.copy()
     strong[3, 0] = 0.02
     assert check(problem, states, strong).actuation == pytest.approx(0.01 - 0.00625)

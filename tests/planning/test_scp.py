@@ -100,6 +100,19 @@ def test_invalid_input_is_a_status_with_a_reason():
     assert "not finite" in solve_scp(valid, broken).message
 
 
+def test_an_off_table_start_is_invalid_for_every_solver():
+    outside = [0.05, 1.0, 0, 0, 0, 0]
+    problem = Problem(HELD_OUT_SCENES[0], outside, [3.2, 1.0, 0, 0, 0, 0])
+    for result in (solve_rel(problem), solve_scp(problem), solve_multistart(problem, 3).best):
+        assert result.status is SCPStatus.INVALID_INPUT
+        assert "off the table" in result.message
+
+
+def test_a_two_step_problem_has_starts():
+    problem = sample_problem(np.random.default_rng(0), final_time=1.0)
+    assert solve_multistart(problem, 3).best.status is SCPStatus.INFEASIBLE_SUBPROBLEM
+
+
 def test_elastic_solves_at_least_as_many():
     rng = np.random.default_rng(5)
     problems = [sample_problem(rng) for _ in range(25)]

@@ -70,6 +70,14 @@ def test_velocity_rows_are_imposed_where_they_bind():
     assert compare(problem, shifted, 0.05, 4)
 
 
+def test_a_reference_that_misses_the_ends():
+    problem = sample_problem(np.random.default_rng(4), HELD_OUT_SCENES[0])
+    reference = solve_multistart(problem, 4).best.trajectory
+    states = reference.states.copy()
+    states[:, 2] += 0.3
+    assert compare(problem, Trajectory(states, reference.controls, reference.dt), 10.0, 4)
+
+
 def test_a_goal_with_velocity_and_two_steps():
     empty = Scenario(
         obstacles=sample_problem(np.random.default_rng(0), n_obstacles=0).scenario.obstacles
