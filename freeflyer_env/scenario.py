@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from freeflyer_env.robot import FloatArray, Robot
+from freeflyer_env.scenes import HELD_OUT, NOMINAL, TRAINING
 
 #: Names of the six state components, in order.
 STATE_NAMES = ("r_x", "r_y", "psi", "v_x", "v_y", "omega")
@@ -328,40 +329,13 @@ def _float32_exact(values: FloatArray) -> FloatArray:
     return values.astype(np.float32).astype(np.float64)
 
 
-# Rows (x, y, radius) in m.
-# fmt: off
-_NOMINAL = ((1.0, 0.7, 0.2), (1.5, 1.7, 0.2), (2.5, 0.75, 0.2), (2.5, 1.75, 0.2))
-_TRAINING = (
-    ((2.5, 1.3, 0.13), (1.2, 1.2, 0.2), (2.0, 0.7, 0.16), (1.9, 1.75, 0.2)),
-    ((2.5, 1.9, 0.15), (1.7, 1.75, 0.2), (1.2, 0.9, 0.18), (2.2, 0.7, 0.12)),
-    ((1.6, 1.4, 0.17), (0.9, 1.75, 0.19), (2.5, 1.9, 0.14), (2.2, 0.7, 0.2)),
-    ((1.3, 0.7, 0.2), (2.6, 1.75, 0.19), (1.0, 1.9, 0.14), (1.9, 1.4, 0.17)),
-    ((1.3, 1.0, 0.16), (2.8, 1.3, 0.13), (2.2, 0.7, 0.2), (1.6, 1.75, 0.23)),
-    ((0.8, 0.5, 0.17), (1.3, 1.7, 0.2), (2.0, 1.05, 0.14), (2.6, 2.05, 0.13)),
-    ((1.5, 0.6, 0.138), (2.1, 1.13, 0.11), (1.1, 1.45, 0.15), (1.9, 2.05, 0.19)),
-    ((1.0, 1.0, 0.123), (1.75, 1.5, 0.151), (2.5, 2.0, 0.131), (2.4, 0.45, 0.184)),
-    ((1.673, 1.284, 0.153), (1.084, 0.536, 0.166), (1.38, 1.978, 0.101), (2.728, 1.178, 0.153)),
-    ((1.627, 1.989, 0.188), (0.889, 0.756, 0.127), (2.238, 0.454, 0.119), (2.07, 1.167, 0.136)),
-    ((1.154, 1.091, 0.151), (1.344, 0.286, 0.108), (2.193, 1.799, 0.199), (2.488, 0.925, 0.127)),
-    ((1.972, 1.233, 0.159), (1.245, 1.853, 0.112), (2.449, 0.494, 0.109), (2.637, 2.06, 0.166)),
-    ((2.187, 1.42, 0.184), (1.513, 0.516, 0.115), (1.107, 2.04, 0.153), (1.149, 1.148, 0.128)),
-    ((1.322, 1.896, 0.156), (2.403, 0.375, 0.155), (1.315, 1.056, 0.172), (2.602, 1.284, 0.116)),
-    ((1.852, 0.661, 0.144), (1.273, 1.054, 0.157), (2.571, 1.286, 0.186), (2.193, 2.028, 0.177)),
-)
-_HELD_OUT = (
-    ((1.3, 1.1, 0.18), (2.2, 1.4, 0.15), (1.0, 1.9, 0.12), (2.4, 0.6, 0.15)),
-    ((1.0, 0.7, 0.13), (1.8, 1.1, 0.16), (1.0, 1.8, 0.14), (2.5, 1.7, 0.15)),
-    ((1.0, 0.7, 0.13), (2.5, 0.8, 0.16), (1.6, 1.35, 0.14), (2.5, 1.7, 0.15)),
-)
-# fmt: on
-
 #: The paper's scenes by name: the nominal one, the 15 of ART-15s, the three held out for tests.
 SCENES: dict[str, Obstacles] = {
-    "nominal": Obstacles.from_rows(_NOMINAL),
-    **{f"training-{i}": Obstacles.from_rows(rows) for i, rows in enumerate(_TRAINING, 1)},
-    **{f"held-out-{i}": Obstacles.from_rows(rows) for i, rows in enumerate(_HELD_OUT, 1)},
+    "nominal": Obstacles.from_rows(NOMINAL),
+    **{f"training-{i}": Obstacles.from_rows(rows) for i, rows in enumerate(TRAINING, 1)},
+    **{f"held-out-{i}": Obstacles.from_rows(rows) for i, rows in enumerate(HELD_OUT, 1)},
 }
 
 #: Scenarios of the 15 training scenes of ART-15s, and of the three test scenes.
-TRAINING_SCENES = tuple(Scenario.named(f"training-{i}") for i in range(1, len(_TRAINING) + 1))
-HELD_OUT_SCENES = tuple(Scenario.named(f"held-out-{i}") for i in range(1, len(_HELD_OUT) + 1))
+TRAINING_SCENES = tuple(Scenario.named(f"training-{i}") for i in range(1, len(TRAINING) + 1))
+HELD_OUT_SCENES = tuple(Scenario.named(f"held-out-{i}") for i in range(1, len(HELD_OUT) + 1))
