@@ -15,7 +15,7 @@ from art_policy.layers import KeyValueCache
 from art_policy.multi_hypothesis import interpolation_matrix
 from art_policy.sequence import ProblemBatch
 from freeflyer_env import dynamics
-from freeflyer_env.planning.multistart import push_out
+from freeflyer_env.planning.homotopy import push_out
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem, Scenario

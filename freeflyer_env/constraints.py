@@ -49,15 +49,44 @@ class ConstraintReport:
         return bool(self.worst[1] <= tolerance)
 
 
-def keep_out_depth(scenario: Scenario, positions: FloatArray) -> FloatArray:
+def keep_out_depth(
+    scenario: Scenario, positions: FloatArray, times: FloatArray | float = 0.0
+) -> FloatArray:
     """How deep positions ``(..., 2)`` are inside the nearest keep-out disc, ``(...)`` in m.
 
     Negative outside: minus the clearance. Without obstacles minus infinity.
+
+    Args:
+        scenario: Gives the obstacles.
+        positions: Of the robot's centre in m.
+        times: When, in s, to broadcast with ``(...)``; matters only if obstacles move.
     """
     positions = np.asarray(positions, dtype=np.float64)
     if not len(scenario.obstacles):
         return np.full(positions.shape[:-1], -np.inf)
-    gaps = np.linalg.norm(positions[..., None, :] - scenario.obstacles.centres, axis=-1)
+    centres = scenario.obstacles.centres_at(times)
+    gaps = np.linalg.norm(positions[..., None, :] - centres, axis=-1)
+    return np.max(scenario.keep_out_radii - gaps, axis=-1)
+
+
+def between_nodes_depth(problem: Problem, states: FloatArray) -> FloatArray:
+    """How deep each segment between nodes is inside a keep-out disc, ``(N - 1,)`` in m; exact.
+
+    Between two nodes robot and obstacles move uniformly, so in an obstacle's frame the robot is on
+    a straight segment, and the nearest point of that is known in closed form. Negative outside.
+
+    Args:
+        problem: Gives the obstacles and the times of the nodes.
+        states: ``(N + 1, 6)``.
+    """
+    scenario, times = problem.scenario, problem.node_times[:-1]
+    if not len(scenario.obstacles):
+        return np.full(len(times) - 1, -np.inf)
+    relative = np.asarray(states)[:-1, None, :2] - scenario.obstacles.centres_at(times)
+    first, along = relative[:-1], np.diff(relative, axis=0)
+    length = np.maximum((along**2).sum(-1), 1e-300)
+    share = np.clip(-(first * along).sum(-1) / length, 0.0, 1.0)
+    gaps = np.linalg.norm(first + share[..., None] * along, axis=-1)
     return np.max(scenario.keep_out_radii - gaps, axis=-1)
 
 
@@ -85,7 +114,9 @@ def check(problem: Problem, states: FloatArray, controls: FloatArray) -> Constra
         start=float(np.abs(states[0] - problem.start).max()),
         goal=float(np.abs(states[-1] - problem.goal).max()),
         table=float(np.maximum(_off_table(scenario, states), 0.0).max()),
-        keep_out=float(np.maximum(keep_out_depth(scenario, states[:, :2]), 0.0).max()),
+        keep_out=float(
+            np.maximum(keep_out_depth(scenario, states[:, :2], problem.node_times), 0.0).max()
+        ),
         actuation=float(
             np.maximum(actuation_excess(scenario, states[:-1, 2], controls), 0.0).max()
         ),
@@ -104,7 +135,8 @@ def violations(
     the actuation limit, by more than ``tolerance``, or is not a number.
     """
     nodes = np.asarray(states)[:-1]
-    excess = np.maximum(_off_table(scenario, nodes), keep_out_depth(scenario, nodes[:, :2]))
+    times = scenario.dt * np.arange(len(nodes), dtype=np.float64)
+    excess = np.maximum(_off_table(scenario, nodes), keep_out_depth(scenario, nodes[:, :2], times))
     excess = np.maximum(excess, actuation_excess(scenario, nodes[:, 2], controls))
     return (~(excess <= tolerance)).astype(np.float64)
 

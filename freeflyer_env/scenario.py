@@ -25,46 +25,78 @@ _ON_BOUNDARY = 2e-7  # m: float32 rounding of a start on the boundary is not a v
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Disc obstacles, fixed to the table.
+    """Disc obstacles on the table, at rest or in uniform motion.
 
     Attributes:
-        centres: ``(M, 2)`` centres in m, table frame.
+        centres: ``(M, 2)`` centres at time zero in m, table frame.
         radii: ``(M,)`` radii in m.
+        velocities: ``(M, 2)`` velocities in m/s; zero if left out. Nothing stops a moving obstacle,
+            not even the edge of the table.
     """
 
     centres: FloatArray
     radii: FloatArray
+    velocities: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        centres = np.asarray(self.centres, dtype=np.float64).reshape(-1, 2)
-        radii = np.asarray(self.radii, dtype=np.float64).reshape(-1)
-        if len(centres) != len(radii):
+        centres = np.array(self.centres, dtype=np.float64).reshape(-1, 2)
+        radii = np.array(self.radii, dtype=np.float64).reshape(-1)
+        still = self.velocities is None
+        velocities = np.array(0.0 * centres if still else self.velocities, dtype=np.float64)
+        velocities = velocities.reshape(-1, 2)
+        if not len(centres) == len(radii) == len(velocities):
             raise ValueError(
-                f"Obstacles need one radius per centre, got {len(centres)} centres "
-                f"and {len(radii)} radii."
+                f"Obstacles need one radius and one velocity per centre, got {len(centres)} "
+                f"centres, {len(radii)} radii and {len(velocities)} velocities."
             )
-        if not (np.isfinite(centres).all() and np.isfinite(radii).all()):
-            raise ValueError("Obstacles must be finite numbers; check centres and radii for NaN.")
+        if not all(np.isfinite(part).all() for part in (centres, radii, velocities)):
+            raise ValueError(
+                "Obstacles must be finite numbers; check centres, radii and velocities for NaN."
+            )
         if (radii <= 0.0).any():
             raise ValueError(f"Obstacles.radii must be positive, got {radii.tolist()}.")
-        centres.setflags(write=False)
-        radii.setflags(write=False)
-        object.__setattr__(self, "centres", centres)
-        object.__setattr__(self, "radii", radii)
+        for name, part in (("centres", centres), ("radii", radii), ("velocities", velocities)):
+            part.setflags(write=False)
+            object.__setattr__(self, name, part)
 
     def __len__(self) -> int:
         return len(self.radii)
 
+    @property
+    def moving(self) -> bool:
+        """Whether any obstacle moves."""
+        return bool(np.any(self.velocities))
+
+    def centres_at(self, times: ArrayLike) -> FloatArray:
+        """``(..., M, 2)`` centres in m at ``times`` ``(...)`` in s."""
+        assert self.velocities is not None
+        return self.centres + np.asarray(times)[..., None, None] * self.velocities
+
+    def after(self, time: float) -> Obstacles:
+        """The obstacles ``time`` seconds later."""
+        return Obstacles(self.centres_at(time), self.radii, self.velocities)
+
     @classmethod
     def from_rows(cls, rows: ArrayLike) -> Obstacles:
-        """Obstacles from ``(M, 3)`` rows ``(x, y, radius)``; rows of radius zero are padding."""
-        table = np.asarray(rows, dtype=np.float64).reshape(-1, 3)
+        """Obstacles from rows ``(x, y, radius)`` or ``(x, y, radius, v_x, v_y)``.
+
+        Rows of radius zero are padding.
+        """
+        table = np.asarray(rows, dtype=np.float64)
+        table = table.reshape(-1, table.shape[-1] if table.size else 3)
+        if table.shape[1] not in (3, 5):
+            raise ValueError(
+                "A row of obstacles is (x, y, radius) or (x, y, radius, v_x, v_y), "
+                f"got {table.shape[1]} numbers."
+            )
         table = table[table[:, 2] != 0.0]
-        return cls(table[:, :2].copy(), table[:, 2].copy())
+        return cls(table[:, :2], table[:, 2], table[:, 3:] if table.shape[1] == 5 else None)
 
     def rows(self) -> FloatArray:
-        """``(M, 3)`` rows ``(x, y, radius)`` in m."""
-        return np.column_stack([self.centres, self.radii])
+        """``(M, 3)`` rows ``(x, y, radius)``; ``(M, 5)`` with velocities if anything moves."""
+        assert self.velocities is not None
+        table = np.column_stack([self.centres, self.radii])
+        return np.hstack([table, self.velocities]) if self.moving else table
 
 
 def _default_obstacles() -> Obstacles:
@@ -175,11 +207,17 @@ class Problem:
         """Number ``N`` of controls."""
         return round(self.final_time / self.scenario.dt)
 
+    @property
+    def node_times(self) -> FloatArray:
+        """``(N + 1,)`` times of the states in s; the last impulse takes no time."""
+        return self.scenario.dt * np.minimum(np.arange(self.n_steps + 1), self.n_steps - 1)
+
     def defects(self) -> list[str]:
         """Why no trajectory can solve this problem, one line per reason; empty if none is seen."""
         lines = []
         low, high = self.scenario.position_limits
-        for name, state in (("start", self.start), ("goal", self.goal)):
+        times = self.node_times[[0, -1]]
+        for name, state, time in zip(("start", "goal"), (self.start, self.goal), times):
             position = state[:2]
             if (position < low - _ON_BOUNDARY).any() or (position > high + _ON_BOUNDARY).any():
                 lines.append(
@@ -187,7 +225,8 @@ class Problem:
                     f"centre must stay in x [{low[0]:g}, {high[0]:g}], "
                     f"y [{low[1]:g}, {high[1]:g}] m"
                 )
-            gaps = np.linalg.norm(position - self.scenario.obstacles.centres, axis=1)
+            centres = self.scenario.obstacles.centres_at(time)
+            gaps = np.linalg.norm(position - centres, axis=1)
             for index, (gap, radius) in enumerate(zip(gaps, self.scenario.keep_out_radii)):
                 if gap < radius - _ON_BOUNDARY:
                     lines.append(

@@ -1,54 +1,34 @@
-"""Solvers beneath the subproblem, behind one small protocol and chosen by name."""
+"""Solvers beneath the subproblem, behind one small protocol and chosen by name.
+
+Which one to use when, with measured times, is in the planning guide (``docs/planning.md``).
+"""
 
 from __future__ import annotations
 
 import difflib
-import enum
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from scipy import sparse
 
+from freeflyer_env.planning.program import ConvexProgram, Solution, SolverStatus, StandardForm
 from freeflyer_env.robot import FloatArray
 
 
-class SolverStatus(enum.Enum):
-    """What a solver said of one linear program."""
-
-    SOLVED = "solved"
-    INFEASIBLE = "infeasible"
-    FAILED = "failed"
-
-
-@dataclass(eq=False)
-class LinearProgram:
-    """``min c'x  s.t.  A x = b,  h_lower <= G x <= h_upper,  x_lower <= x <= x_upper``.
-
-    The patterns of ``a`` and ``g`` and the values of ``c`` and ``a`` never change once given to a
-    backend; everything else may be overwritten between solves.
-    """
-
-    c: FloatArray
-    a: sparse.csc_matrix
-    b: FloatArray
-    g: sparse.csc_matrix
-    h_lower: FloatArray
-    h_upper: FloatArray
-    x_lower: FloatArray
-    x_upper: FloatArray
-
-
 class Backend(Protocol):
-    """Solves one linear program again and again, with new values each time."""
+    """Solves one convex program again and again, with new values each time."""
 
-    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
-        """Status and, where solved, the primal solution."""
+    #: Whether second-order cones, that is a ball-shaped trust region, can be solved.
+    cones: ClassVar[bool]
+
+    def solve(self, program: ConvexProgram) -> Solution:
+        """Solves the program; an outcome that can be expected is a status, not an exception."""
 
 
 class PIQPBackend:
     """PIQP, a proximal interior-point method; one solver object, updated in place."""
+
+    cones: ClassVar[bool] = False
 
     def __init__(self) -> None:
         try:
@@ -66,44 +46,170 @@ class PIQPBackend:
         self._solver.settings.preconditioner_iter = 0
         self._is_set_up = False
 
-    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
-        values = (program.g, program.h_lower, program.h_upper, program.x_lower, program.x_upper)
+    def solve(self, program: ConvexProgram) -> Solution:
+        limits = (program.h_lower, program.h_upper, program.x_lower, program.x_upper)
         if self._is_set_up:
-            self._solver.update(None, None, None, program.b, *values)
+            self._solver.update(None, program.c, None, program.b, program.g, *limits)
         else:
             n = len(program.c)
             zero = sparse.csc_matrix((n, n))
-            self._solver.setup(zero, program.c, program.a, program.b, *values)
+            self._solver.setup(zero, program.c, program.a, program.b, program.g, *limits)
             self._is_set_up = True
         status = self._solver.solve()
-        if status == self._piqp.PIQP_SOLVED:
-            return SolverStatus.SOLVED, self._solver.result.x
         if status == self._piqp.PIQP_PRIMAL_INFEASIBLE:
-            return SolverStatus.INFEASIBLE, self._solver.result.x
-        # Rare, and mostly a program that is infeasible by a hair: the simplex method decides.
-        return HiGHSBackend().solve(program)
+            return Solution.unsolved(SolverStatus.INFEASIBLE)
+        if status != self._piqp.PIQP_SOLVED:
+            # Rare, and mostly a program that is infeasible by a hair: the simplex method decides.
+            return HiGHSBackend().solve(program)
+        found = self._solver.result
+        z, w = found.z_u - found.z_l, found.z_bu - found.z_bl
+        return Solution(SolverStatus.SOLVED, found.x, found.y, z, w, np.empty((0, 0)))
 
 
 class HiGHSBackend:
-    """HiGHS, the simplex method by way of SciPy: slower, and exact about infeasibility."""
+    """HiGHS, the dual simplex method; starts from the basis of the program solved last.
 
-    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
-        from scipy.optimize import linprog
+    Exact about infeasibility. Where a program has several optima, which one it gives may depend on
+    the programs solved before.
+    """
 
-        above, below = np.isfinite(program.h_upper), np.isfinite(program.h_lower)
-        result = linprog(
-            program.c,
-            A_ub=sparse.vstack([program.g[above], -program.g[below]]),
-            b_ub=np.concatenate([program.h_upper[above], -program.h_lower[below]]),
-            A_eq=program.a,
-            b_eq=program.b,
-            bounds=np.column_stack([program.x_lower, program.x_upper]),
-            method="highs-ds",
+    cones: ClassVar[bool] = False
+
+    def __init__(self) -> None:
+        import highspy
+
+        self._highspy = highspy
+        self._solver = highspy.Highs()
+        for option, value in (("output_flag", False), ("solver", "simplex"), ("threads", 1)):
+            self._solver.setOptionValue(option, value)
+        self._basis: Any = None
+
+    def solve(self, program: ConvexProgram) -> Solution:
+        p, n_rows = program, len(program.b)
+        matrix = sparse.vstack([p.a, p.g], format="csc")
+        lp = self._highspy.HighsLp()
+        lp.num_col_, lp.num_row_ = len(p.c), matrix.shape[0]
+        lp.col_cost_, lp.col_lower_, lp.col_upper_ = p.c, p.x_lower, p.x_upper
+        lp.row_lower_ = np.concatenate([p.b, p.h_lower])
+        lp.row_upper_ = np.concatenate([p.b, p.h_upper])
+        lp.a_matrix_.format_ = self._highspy.MatrixFormat.kColwise
+        lp.a_matrix_.start_ = matrix.indptr
+        lp.a_matrix_.index_ = matrix.indices
+        lp.a_matrix_.value_ = matrix.data
+        self._solver.passModel(lp)
+        if self._basis is not None:
+            self._solver.setBasis(self._basis)
+        self._solver.run()
+        status = self._solver.getModelStatus()
+        if status == self._highspy.HighsModelStatus.kOptimal:
+            found = self._solver.getSolution()
+            self._basis = self._solver.getBasis()
+            rows = -np.asarray(found.row_dual)
+            return Solution(
+                SolverStatus.SOLVED,
+                np.asarray(found.col_value),
+                rows[:n_rows],
+                rows[n_rows:],
+                -np.asarray(found.col_dual),
+                np.empty((0, 0)),
+            )
+        infeasible = (
+            self._highspy.HighsModelStatus.kInfeasible,
+            self._highspy.HighsModelStatus.kUnboundedOrInfeasible,
         )
-        if result.status == 0:
-            return SolverStatus.SOLVED, result.x
-        failed = SolverStatus.INFEASIBLE if result.status == 2 else SolverStatus.FAILED
-        return failed, np.zeros_like(program.c)
+        failed = SolverStatus.INFEASIBLE if status in infeasible else SolverStatus.FAILED
+        return Solution.unsolved(failed)
+
+
+class ClarabelBackend:
+    """Clarabel, an interior-point method with second-order cones; updated in place."""
+
+    cones: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        import clarabel
+
+        self._clarabel = clarabel
+        self._solver: Any = None
+
+    def solve(self, program: ConvexProgram) -> Solution:
+        clarabel, n_equal = self._clarabel, len(program.b)
+        if self._solver is None:
+            self._form = form = StandardForm(program)
+            # The pattern of [A; F] column by column, and where the entries of F are in it.
+            stacked = sparse.vstack([program.a, form.matrix], format="csc")
+            stacked.sort_indices()
+            self._is_f = stacked.indices >= n_equal
+            self._data = stacked.data.copy()
+            cones = [clarabel.ZeroConeT(n_equal), clarabel.NonnegativeConeT(form.n_linear)]
+            if program.balls is not None:
+                dimension = program.balls.centres.shape[1] + 1
+                cones += form.n_balls * [clarabel.SecondOrderConeT(dimension)]
+            settings = clarabel.DefaultSettings()
+            settings.verbose = settings.presolve_enable = settings.input_sparse_dropzeros = False
+            settings.max_threads = 1
+            n = len(program.c)
+            self._solver = clarabel.DefaultSolver(
+                sparse.csc_matrix((n, n)), program.c, stacked, self._right(program), cones, settings
+            )
+        else:
+            self._data[self._is_f] = self._form.data(program)
+            self._solver.update(q=program.c, A=self._data, b=self._right(program))
+        found = self._solver.solve()
+        if found.status == clarabel.SolverStatus.Solved:
+            x, z = np.asarray(found.x), np.asarray(found.z)
+            return self._form.solution(program, x, z[:n_equal], z[n_equal:])
+        if found.status == clarabel.SolverStatus.PrimalInfeasible:
+            return Solution.unsolved(SolverStatus.INFEASIBLE)
+        if program.balls is None:
+            return HiGHSBackend().solve(program)
+        infeasible = found.status == clarabel.SolverStatus.AlmostPrimalInfeasible
+        return Solution.unsolved(SolverStatus.INFEASIBLE if infeasible else SolverStatus.FAILED)
+
+    def _right(self, program: ConvexProgram) -> FloatArray:
+        return np.concatenate([program.b, self._form.right_hand_side(program)])
+
+
+class QOCOBackend:
+    """QOCO, an interior-point method with second-order cones; updated in place.
+
+    It does not detect infeasibility: where it does not converge, HiGHS decides, or Clarabel if
+    there are cones.
+    """
+
+    cones: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        try:
+            import qoco
+        except ImportError as error:
+            raise ModuleNotFoundError(
+                'This backend needs QOCO: pip install "freeflyer-gym[solvers]".'
+            ) from error
+        self._qoco = qoco
+        self._solver: Any = None
+
+    def solve(self, program: ConvexProgram) -> Solution:
+        if self._solver is None:
+            self._form = form = StandardForm(program)
+            self._solver = self._qoco.QOCO()
+            n, m, n_equal = len(program.c), form.matrix.shape[0], len(program.b)
+            right = form.right_hand_side(program)
+            dimension = 0 if program.balls is None else program.balls.centres.shape[1] + 1
+            cones = np.full(form.n_balls, dimension, dtype=np.int32)
+            data = (None, program.c, program.a, program.b, form.matrix, right)
+            self._solver.setup(n, m, n_equal, *data, form.n_linear, form.n_balls, cones)
+        else:
+            self._solver.update_matrix_data(G=self._form.data(program))
+            self._solver.update_vector_data(
+                c=program.c, b=program.b, h=self._form.right_hand_side(program)
+            )
+        found = self._solver.solve()
+        if found.status == "QOCO_SOLVED":
+            return self._form.solution(program, *(np.array(v) for v in (found.x, found.y, found.z)))
+        if program.balls is None:
+            return HiGHSBackend().solve(program)
+        return ClarabelBackend().solve(program)
 
 
 class OSQPBackend:
@@ -112,10 +218,12 @@ class OSQPBackend:
     It is here for comparison. Its solutions hold to about 1e-4 of the largest delta-V.
     """
 
-    def solve(self, program: LinearProgram) -> tuple[SolverStatus, FloatArray]:
+    cones: ClassVar[bool] = False
+
+    def solve(self, program: ConvexProgram) -> Solution:
         import osqp
 
-        n = len(program.c)
+        n, n_equal = len(program.c), len(program.b)
         solver = osqp.OSQP()
         solver.setup(
             sparse.csc_matrix((n, n)),
@@ -128,18 +236,58 @@ class OSQPBackend:
             max_iter=50_000,
             verbose=False,
         )
-        result = solver.solve(raise_error=False)
-        if result.info.status == "solved":
-            return SolverStatus.SOLVED, np.asarray(result.x)
-        infeasible = "infeasible" in result.info.status
-        return SolverStatus.INFEASIBLE if infeasible else SolverStatus.FAILED, np.zeros(n)
+        found = solver.solve(raise_error=False)
+        if found.info.status == "solved":
+            y, z, w = np.split(np.asarray(found.y), [n_equal, n_equal + len(program.h_lower)])
+            return Solution(SolverStatus.SOLVED, np.asarray(found.x), y, z, w, np.empty((0, 0)))
+        infeasible = "infeasible" in found.info.status
+        return Solution.unsolved(SolverStatus.INFEASIBLE if infeasible else SolverStatus.FAILED)
 
 
-BACKENDS: dict[str, Callable[[], Backend]] = {
+#: Backends by name. A name ``cvxpy:<SOLVER>`` is none of these: the reference statement is solved.
+BACKENDS: dict[str, type[Backend]] = {
     "piqp": PIQPBackend,
+    "clarabel": ClarabelBackend,
+    "qoco": QOCOBackend,
     "highs": HiGHSBackend,
     "osqp": OSQPBackend,
 }
+
+#: Prefix of the names that solve the CVXPY statement with one of CVXPY's solvers.
+CVXPY_PREFIX = "cvxpy:"
+
+
+def check_backend(name: str, *, cones: bool = False) -> None:
+    """Raises unless there is a backend of that name which can do what is asked.
+
+    Args:
+        name: A name in :data:`BACKENDS`, or ``cvxpy:`` and the name of a solver of CVXPY's.
+        cones: Whether second-order cones are needed (a ball-shaped trust region).
+
+    Raises:
+        ValueError: With the nearest name, or the names of the backends that can.
+    """
+    if name.startswith(CVXPY_PREFIX):
+        import cvxpy
+
+        solver = name.removeprefix(CVXPY_PREFIX).upper()
+        if solver not in cvxpy.installed_solvers():
+            known = ", ".join(cvxpy.installed_solvers())
+            raise ValueError(f"CVXPY has no solver {solver!r} here. Installed: {known}.")
+        return
+    if name not in BACKENDS:
+        near = difflib.get_close_matches(name, BACKENDS, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise ValueError(
+            f"No solver backend is called {name!r}.{hint} Known: {', '.join(BACKENDS)}, "
+            f"{CVXPY_PREFIX}<SOLVER>."
+        )
+    if cones and not BACKENDS[name].cones:
+        able = ", ".join(other for other, backend in BACKENDS.items() if backend.cones)
+        raise ValueError(
+            f"Backend {name!r} has no second-order cones, which a ball-shaped trust region needs; "
+            f"use one of {able}, or {CVXPY_PREFIX}CLARABEL."
+        )
 
 
 def make_backend(name: str) -> Backend:
@@ -148,10 +296,5 @@ def make_backend(name: str) -> Backend:
     Raises:
         ValueError: If no backend has that name; the message names the nearest one.
     """
-    if name not in BACKENDS:
-        near = difflib.get_close_matches(name, BACKENDS, n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise ValueError(
-            f"No solver backend is called {name!r}.{hint} Known: {', '.join(BACKENDS)}."
-        )
+    check_backend(name)
     return BACKENDS[name]()

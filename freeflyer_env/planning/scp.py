@@ -3,6 +3,9 @@
 At each iteration the keep-out and actuation constraints are linearised about the last iterate and
 the subproblem is solved in a trust region that shrinks geometrically. REL, the relaxation without
 keep-out, goes through the same loop. Failures are values, not exceptions.
+
+Two options keep a bad warm start from stopping the loop: slack on keep-out (``elastic``), and other
+homotopy classes as warm starts where the given one leads nowhere (``reroutes``).
 """
 
 from __future__ import annotations
@@ -11,16 +14,28 @@ import enum
 import threading
 import time
 from collections import OrderedDict
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, ConstraintReport
 from freeflyer_env.constraints import check as check_constraints
-from freeflyer_env.planning.backends import BACKENDS, SolverStatus, make_backend
+from freeflyer_env.planning.backends import CVXPY_PREFIX, check_backend
+from freeflyer_env.planning.homotopy import homotopy_starts
+from freeflyer_env.planning.infeasibility import why_infeasible
+from freeflyer_env.planning.program import KKTResiduals, SolverStatus
 from freeflyer_env.planning.subproblem import Subproblem
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.scenario import Obstacles, Problem
+
+if TYPE_CHECKING:
+    from freeflyer_env.planning.reference import ReferenceSubproblem
+
+#: Price of a metre of slack at a node in multiples of the largest delta-V: first, growth at each
+#: use, last. The last one is above the keep-out multipliers seen, so slack is used only at need.
+_FIRST_PRICE, _PRICE_GROWTH, _LAST_PRICE = 5.0, 10.0, 50_000.0
 
 
 class SCPStatus(enum.Enum):
@@ -29,6 +44,8 @@ class SCPStatus(enum.Enum):
     SOLVED = "solved"
     ITERATION_LIMIT = "iteration_limit"
     INFEASIBLE_SUBPROBLEM = "infeasible_subproblem"
+    INFEASIBLE_PROBLEM = "infeasible_problem"
+    SLACK_LEFT = "slack_left"
     NUMERICAL_FAILURE = "numerical_failure"
     INVALID_INPUT = "invalid_input"
 
@@ -45,8 +62,13 @@ _REMEDIES = {
         "warm start."
     ),
     SCPStatus.INFEASIBLE_SUBPROBLEM: (
-        "The problem linearised about this warm start has no solution; try another warm start "
-        "(solve_multistart) or a longer final time."
+        "The problem linearised about this warm start has no solution; try SCPConfig.robust(), "
+        "another warm start (solve_multistart) or a longer final time."
+    ),
+    SCPStatus.INFEASIBLE_PROBLEM: "The problem provably has no solution; change the problem.",
+    SCPStatus.SLACK_LEFT: (
+        "Settled on a trajectory that is still inside a keep-out disc; allow more "
+        "SCPConfig.reroutes, or a longer final time."
     ),
     SCPStatus.NUMERICAL_FAILURE: (
         "The solver gave up on a subproblem; try another warm start or another backend."
@@ -60,31 +82,52 @@ class SCPConfig:
     """Settings of the SCP loop; the defaults are the paper authors'.
 
     Attributes:
-        backend: Solver of the subproblems, a name in ``freeflyer_env.planning.backends.BACKENDS``.
-        max_iterations: Most subproblems that are solved.
+        backend: Solver of the subproblems: a name in
+            ``freeflyer_env.planning.backends.BACKENDS``, or ``cvxpy:<SOLVER>``.
+        max_iterations: Most subproblems that are solved from one warm start.
         trust_region_start: First half-width of the trust region (m, rad, m/s, rad/s alike).
         trust_region_end: Half-width at the last allowed iteration.
+        trust_region_shape: ``"box"`` makes the subproblem a linear program; ``"ball"`` bounds the
+            2-norm of each state's change and needs a backend with second-order cones.
         state_tolerance: Converged if no node's state moved by more than this (2-norm).
         cost_tolerance: Converged if, besides, the cost changed by less than this.
+        between_nodes: Whether keep-out is imposed on the straight segments between nodes, too.
         elastic: Whether an infeasible subproblem is solved again with slack on keep-out instead of
             ending the loop. The answer counts as solved only without slack.
+        reroutes: How many other homotopy classes are tried, shortest path first, where the warm
+            start leads to no solution. With ``elastic``, slack is the last resort then.
     """
 
     backend: str = "piqp"
     max_iterations: int = 20
     trust_region_start: float = 10.0
     trust_region_end: float = 0.005
+    trust_region_shape: Literal["box", "ball"] = "box"
     state_tolerance: float = 0.005
     cost_tolerance: float = 1e-6
+    between_nodes: bool = False
     elastic: bool = False
+    reroutes: int = 0
+
+    @classmethod
+    def robust(cls, **settings: Any) -> SCPConfig:
+        """Settings to fly with: elastic, rerouted, and clear of obstacles between the nodes too."""
+        return cls(**{"between_nodes": True, "elastic": True, "reroutes": 12, **settings})
 
     def __post_init__(self) -> None:
-        if self.backend not in BACKENDS:
-            make_backend(self.backend)  # raises with the nearest name
+        if self.trust_region_shape not in ("box", "ball"):
+            raise ValueError(
+                "SCPConfig.trust_region_shape must be 'box' or 'ball', got "
+                f"{self.trust_region_shape!r}."
+            )
+        if self.backend != "piqp" or self.trust_region_shape == "ball":
+            check_backend(self.backend, cones=self.trust_region_shape == "ball")
         if self.max_iterations < 2:
             raise ValueError(
                 f"SCPConfig.max_iterations must be at least 2, got {self.max_iterations}."
             )
+        if self.reroutes < 0:
+            raise ValueError(f"SCPConfig.reroutes must not be negative, got {self.reroutes}.")
         if not 0.0 < self.trust_region_end <= self.trust_region_start < np.inf:
             raise ValueError(
                 "SCPConfig needs 0 < trust_region_end <= trust_region_start, got "
@@ -108,11 +151,14 @@ class SCPResult:
     Attributes:
         status: How it ended.
         trajectory: The last iterate, or None if no subproblem was solved.
-        iterations: Number of subproblems solved (the failing one included).
-        cost_history: Cost of each iterate.
+        iterations: Number of subproblems solved (failing ones and those of reroutes included).
+        cost_history: Cost of each iterate of the last route.
         solve_time: Wall time in s, all in.
         report: Independent check of ``trajectory``, or None.
-        message: One line for people.
+        message: One line for people: what the status means and what to do about it.
+        kkt: Residuals of the optimality conditions of the last subproblem if solved, else None
+            (also for ``cvxpy:`` backends).
+        rerouted: Number of further attempts, from other homotopy classes or with slack.
     """
 
     status: SCPStatus
@@ -122,6 +168,8 @@ class SCPResult:
     solve_time: float
     report: ConstraintReport | None
     message: str
+    kkt: KKTResiduals | None = None
+    rerouted: int = 0
 
     @property
     def solved(self) -> bool:
@@ -179,9 +227,11 @@ def solve_scp(
         return _failure(SCPStatus.INVALID_INPUT, began, detail="; ".join(defects))
     if warm_start is None:
         rel = solve_rel(problem, config)
-        if rel.trajectory is None:
+        if rel.trajectory is None and (
+            rel.status is SCPStatus.INFEASIBLE_PROBLEM or not config.reroutes
+        ):
             return rel
-        warm_start = rel.trajectory
+        warm_start = rel.trajectory or straight_line(problem)
     if (warm_start.n_steps, warm_start.dt) != (problem.n_steps, problem.scenario.dt):
         detail = (
             f"the warm start has {warm_start.n_steps} steps of {warm_start.dt} s, "
@@ -190,7 +240,40 @@ def solve_scp(
         return _failure(SCPStatus.INVALID_INPUT, began, detail=detail)
     if not (np.isfinite(warm_start.states).all() and np.isfinite(warm_start.controls).all()):
         return _failure(SCPStatus.INVALID_INPUT, began, detail="the warm start is not finite")
-    return _solve(problem, warm_start, config, keep_out=True, began=began)
+    attempts: list[SCPResult] = []
+    for start, elastic in _routes(problem, warm_start, config):
+        attempt = replace(config, elastic=elastic)
+        attempts.append(_solve(problem, start, attempt, keep_out=True, began=began))
+        if attempts[-1].solved or attempts[-1].status is SCPStatus.INFEASIBLE_PROBLEM:
+            result = attempts[-1]
+            break
+    else:
+        result = min(attempts, key=_depth)
+    iterations = sum(attempt.iterations for attempt in attempts)
+    elapsed = time.perf_counter() - began
+    return replace(result, iterations=iterations, rerouted=len(attempts) - 1, solve_time=elapsed)
+
+
+def _routes(
+    problem: Problem, warm_start: Trajectory, config: SCPConfig
+) -> Iterator[tuple[Trajectory, bool]]:
+    """Warm starts in the order in which they are tried, and whether with slack.
+
+    Slack costs many iterations, so every route is tried without it first.
+    """
+    if not config.reroutes:
+        yield warm_start, config.elastic
+        return
+    yield warm_start, False
+    others = homotopy_starts(problem, config.reroutes)
+    yield from ((other, False) for other in others)
+    if config.elastic:
+        yield from ((start, True) for start in [warm_start, *others])
+
+
+def _depth(result: SCPResult) -> float:
+    """Orders failures: how deep the trajectory is inside keep-out discs."""
+    return result.report.keep_out if result.report else np.inf
 
 
 def _solve(
@@ -202,24 +285,26 @@ def _solve(
     began: float | None = None,
 ) -> SCPResult:
     began = time.perf_counter() if began is None else began
-    subproblem = _subproblem(problem, keep_out, config.backend)
+    subproblem = _subproblem(problem, keep_out, config)
     soften = config.elastic and keep_out
+    price = _FIRST_PRICE
     costs: list[float] = []
     trajectory: Trajectory | None = None
+    status = SCPStatus.ITERATION_LIMIT
+    solved_by: Subproblem | ReferenceSubproblem | None = None
     for iteration in range(config.max_iterations):
         trust_region = config.trust_region(iteration)
+        solved_by = subproblem
         solution = subproblem.solve(problem, reference, trust_region)
         softened = solution.trajectory is None and soften
         if softened:
-            elastic = _subproblem(problem, keep_out, config.backend, elastic=True)
-            solution = elastic.solve(problem, reference, trust_region)
+            solved_by = _subproblem(problem, keep_out, config, elastic=True)
+            solution = solved_by.solve(problem, reference, trust_region, price)
+            price = min(price * _PRICE_GROWTH, _LAST_PRICE)
         if solution.trajectory is None:
-            status = (
-                SCPStatus.INFEASIBLE_SUBPROBLEM
-                if solution.status is SolverStatus.INFEASIBLE
-                else SCPStatus.NUMERICAL_FAILURE
-            )
-            return _finish(problem, status, trajectory, costs, iteration + 1, began)
+            infeasible = solution.status is SolverStatus.INFEASIBLE
+            status = SCPStatus.INFEASIBLE_SUBPROBLEM if infeasible else SCPStatus.NUMERICAL_FAILURE
+            break
         trajectory = solution.trajectory
         costs.append(trajectory.cost)
         moved = np.linalg.norm(trajectory.states - reference.states, axis=1).max()
@@ -228,35 +313,32 @@ def _solve(
             continue
         if abs(costs[-1] - costs[-2]) >= config.cost_tolerance:
             continue
-        if _verified(problem, trajectory, keep_out):
-            return _finish(problem, SCPStatus.SOLVED, trajectory, costs, iteration + 1, began)
-        if softened:
-            # Settled with slack left: more iterations would only pay for it again.
-            status = SCPStatus.INFEASIBLE_SUBPROBLEM
-            return _finish(problem, status, trajectory, costs, iteration + 1, began)
-    return _finish(
-        problem, SCPStatus.ITERATION_LIMIT, trajectory, costs, config.max_iterations, began
-    )
-
-
-def _verified(problem: Problem, trajectory: Trajectory, keep_out: bool) -> bool:
-    report = check_constraints(problem, trajectory.states, trajectory.controls)
-    if not keep_out:
-        report = replace(report, keep_out=0.0)
-    return report.satisfied(FEASIBILITY_TOLERANCE)
-
-
-def _finish(
-    problem: Problem,
-    status: SCPStatus,
-    trajectory: Trajectory | None,
-    costs: list[float],
-    iterations: int,
-    began: float,
-) -> SCPResult:
+        if _verified(problem, trajectory, keep_out, config.between_nodes):
+            status = SCPStatus.SOLVED
+            break
+        if softened and price == _LAST_PRICE:
+            break  # settled with slack left: more iterations would only pay for it again
+    if status is SCPStatus.ITERATION_LIMIT and solution.slack > FEASIBILITY_TOLERANCE:
+        status = SCPStatus.SLACK_LEFT
+    kkt = solved_by.kkt_residuals() if solved_by and status is SCPStatus.SOLVED else None
+    message = status.remedy
+    if status is not SCPStatus.SOLVED and (reason := why_infeasible(problem, keep_out=keep_out)):
+        status = SCPStatus.INFEASIBLE_PROBLEM
+        message = f"{status.remedy[:-1]}: {reason}."
     report = trajectory.check(problem) if trajectory else None
     elapsed = time.perf_counter() - began
-    return SCPResult(status, trajectory, iterations, tuple(costs), elapsed, report, status.remedy)
+    return SCPResult(status, trajectory, iteration + 1, tuple(costs), elapsed, report, message, kkt)
+
+
+def _verified(
+    problem: Problem, trajectory: Trajectory, keep_out: bool, between_nodes: bool
+) -> bool:
+    report = check_constraints(problem, trajectory.states, trajectory.controls)
+    if not keep_out:
+        return replace(report, keep_out=0.0).satisfied()
+    if between_nodes and trajectory.between_nodes_depth(problem) > FEASIBILITY_TOLERANCE:
+        return False
+    return report.satisfied()
 
 
 def _failure(status: SCPStatus, began: float, detail: str) -> SCPResult:
@@ -269,17 +351,27 @@ _local = threading.local()
 
 
 def _subproblem(
-    problem: Problem, keep_out: bool, backend: str, *, elastic: bool = False
-) -> Subproblem:
+    problem: Problem, keep_out: bool, config: SCPConfig, *, elastic: bool = False
+) -> Subproblem | ReferenceSubproblem:
     """The assembled subproblem of this size; each thread keeps the ones it used last."""
-    scenario = problem.scenario
+    scenario, backend = problem.scenario, config.backend
+    ball, segments = config.trust_region_shape == "ball", config.between_nodes and keep_out
+    if backend.startswith(CVXPY_PREFIX):
+        from freeflyer_env.planning.reference import ReferenceSubproblem
+
+        return ReferenceSubproblem(
+            backend.removeprefix(CVXPY_PREFIX).upper(),
+            keep_out=keep_out,
+            elastic=elastic,
+            between_nodes=segments,
+            ball=ball,
+        )
     n_obstacles = len(scenario.obstacles) if keep_out else 0
-    key = (problem.n_steps, n_obstacles, scenario.dt, scenario.robot, backend, elastic)
+    size = (problem.n_steps, n_obstacles, scenario.dt, scenario.robot, backend)
+    key = (*size, elastic, segments, ball)
     cache: OrderedDict[tuple, Subproblem] = _local.__dict__.setdefault("cache", OrderedDict())
     if key not in cache:
-        cache[key] = Subproblem(
-            problem.n_steps, n_obstacles, scenario.dt, scenario.robot, backend, elastic=elastic
-        )
+        cache[key] = Subproblem(*size, elastic=elastic, between_nodes=segments, ball=ball)
     cache.move_to_end(key)
     while len(cache) > _MOST_SUBPROBLEMS:
         cache.popitem(last=False)

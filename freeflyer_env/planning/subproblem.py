@@ -15,43 +15,39 @@ is::
 where ``g = (1, 1, m / J)``, ``M(psi) = Lambda^+ R_GB(psi)'`` gives the clusters' delta-Vs, ``c_m``
 and ``d_m`` are the obstacles' centres and keep-out radii, and the velocities before the first and
 after the last impulse, the start's and the goal's, take the place of the differences that leave the
-horizon. In the elastic form each interior node has a slack ``s_k >= 0`` that is added to its
-keep-out rows and priced in the objective, so that a bad reference cannot make the program
-infeasible. This is the OCP of the paper's eq. 4 with nine variables a node.
+horizon. This is the OCP of the paper's eq. 4 with nine variables a node. Variants:
+
+* *elastic*: each interior node has a slack ``s_k >= 0`` that is added to its keep-out rows and
+  priced in the objective, so that a bad reference cannot make the program infeasible;
+* *between nodes*: ``d_m`` grows at each node to ``hypot(d_m, L / 2)``, ``L`` the reference's longer
+  step at that node in the obstacle's frame: the straight way between nodes stays outside then;
+* *ball*: the trust region is ``||x_k - x_ref,k||_2 <= rho`` at each node, a second-order cone.
+
+The planning guide (``docs/planning.md``) derives all of it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy import sparse
 
-from freeflyer_env.planning.backends import LinearProgram, SolverStatus, make_backend
+from freeflyer_env.planning.backends import make_backend
+from freeflyer_env.planning.program import (
+    Balls,
+    ConvexProgram,
+    KKTResiduals,
+    Solution,
+    SolverStatus,
+    SubproblemSolution,
+    kkt_residuals,
+)
 from freeflyer_env.planning.trajectory import Trajectory
-from freeflyer_env.robot import Robot
+from freeflyer_env.robot import FloatArray, Robot
 from freeflyer_env.scenario import Problem
-
-#: Price of a metre of slack in multiples of the largest delta-V; above the keep-out multipliers
-#: seen.
-_SLACK_PRICE = 5000.0
-
-
-@dataclass(frozen=True, eq=False)
-class SubproblemSolution:
-    """A solved (or failed) subproblem.
-
-    Attributes:
-        status: What the solver said.
-        trajectory: The solution, None unless solved.
-    """
-
-    status: SolverStatus
-    trajectory: Trajectory | None
 
 
 class Subproblem:
-    """One linear program of fixed size, solved many times with new values.
+    """One convex program of fixed size and form, solved many times with new values.
 
     Args:
         n_steps: Number ``N`` of controls, at least 2.
@@ -60,6 +56,8 @@ class Subproblem:
         robot: Mass properties and thrusters.
         backend: Name of the solver (see :mod:`freeflyer_env.planning.backends`).
         elastic: Whether keep-out may be violated at a price.
+        between_nodes: Whether the way between the nodes is kept out of the discs, too.
+        ball: Whether the trust region is a ball, which needs a backend with cones, or a box.
         velocity_rows: Whether the trust region on velocities is imposed from the start. It hardly
             ever binds, so by default it is left out, checked afterwards, and imposed where it was
             violated.
@@ -74,19 +72,21 @@ class Subproblem:
         backend: str = "piqp",
         *,
         elastic: bool = False,
+        between_nodes: bool = False,
+        ball: bool = False,
         velocity_rows: bool = False,
     ) -> None:
         self.n_steps, self.n_obstacles, self.dt, self.robot = n_steps, n_obstacles, dt, robot
-        self.backend, self.elastic, self.velocity_rows = backend, elastic, velocity_rows
+        self.backend, self.elastic, self.between_nodes = backend, elastic, between_nodes
+        self.ball, self.velocity_rows = ball, velocity_rows
         self._with_velocity_rows: Subproblem | None = None
         delta_v_max = robot.delta_v_max(dt)
         self._scale = delta_v_max * np.array([1.0, 1.0, robot.lever_arm])
         self._index_variables()
         prices = np.zeros(self._n_variables)
         prices[self._split_columns] = self._scale / delta_v_max
-        prices[self._slack_columns] = _SLACK_PRICE
         g = self._inequality_matrix()
-        self._program = LinearProgram(
+        self._program = ConvexProgram(
             c=prices,
             a=self._dynamics_matrix(),
             b=np.zeros(3 * n_steps),
@@ -95,19 +95,27 @@ class Subproblem:
             h_upper=np.full(g.shape[0], np.inf),
             x_lower=np.zeros(self._n_variables),
             x_upper=np.full(self._n_variables, np.inf),
+            balls=self._balls() if ball else None,
         )
+        self._solution = Solution.unsolved(SolverStatus.FAILED)
         self._backend = make_backend(backend)
 
     def solve(
-        self, problem: Problem, reference: Trajectory, trust_region: float
+        self,
+        problem: Problem,
+        reference: Trajectory,
+        trust_region: float,
+        slack_price: float = 5000.0,
     ) -> SubproblemSolution:
         """Linearises ``problem`` about ``reference`` and solves.
 
         Args:
             problem: A problem of this size; its obstacles are ignored if ``n_obstacles`` is 0.
             reference: ``x_ref`` and ``u_ref``.
-            trust_region: Half-width ``rho`` of the box about the reference states, in m, rad, m/s
-                and rad/s alike.
+            trust_region: Half-width ``rho`` of the box (radius of the ball) about the reference
+                states, in m, rad, m/s and rad/s alike.
+            slack_price: Price of a metre of slack at one node, in multiples of the largest delta-V;
+                for the elastic form.
         """
         self._set_dynamics(problem)
         self._set_actuation(problem, reference)
@@ -115,16 +123,32 @@ class Subproblem:
         self._set_bounds(problem, reference, trust_region)
         if self.velocity_rows:
             self._set_velocity_rows(problem, reference, trust_region)
-        status, x = self._backend.solve(self._program)
-        if status is not SolverStatus.SOLVED:
-            return SubproblemSolution(status, None)
+        if self.elastic:
+            self._program.c[self._slack_columns] = slack_price
+        self._solution = solution = self._backend.solve(self._program)
+        if solution.status is not SolverStatus.SOLVED:
+            return SubproblemSolution(solution.status, None)
         poses = np.empty((self.n_steps, 3))
-        poses[1:-1] = x[self._pose_columns]
+        poses[1:-1] = solution.x[self._pose_columns]
         trajectory = Trajectory.from_poses(problem, poses, with_controls=True)
         moved = np.abs(trajectory.states[1:-1, 3:] - reference.states[1:-1, 3:]).max()
-        if not self.velocity_rows and moved > trust_region:
-            return self._strict().solve(problem, reference, trust_region)
-        return SubproblemSolution(status, trajectory)
+        if not (self.velocity_rows or self.ball) and moved > trust_region:
+            strict = self._strict()
+            found = strict.solve(problem, reference, trust_region, slack_price)
+            self._solution = strict._solution
+            return found
+        slack = float(solution.x[self._slack_columns].sum())
+        return SubproblemSolution(solution.status, trajectory, slack)
+
+    def kkt_residuals(self) -> KKTResiduals:
+        """How exactly the program solved last satisfies its optimality conditions.
+
+        Units: largest delta-V for the objective and the actuation rows, m and rad elsewhere.
+        """
+        program = self._program
+        if self._with_velocity_rows and self._solution is self._with_velocity_rows._solution:
+            program = self._with_velocity_rows._program
+        return kkt_residuals(program, self._solution)
 
     def _strict(self) -> Subproblem:
         """The same subproblem with its velocity rows, made when first needed."""
@@ -136,6 +160,7 @@ class Subproblem:
                 self.robot,
                 self.backend,
                 elastic=self.elastic,
+                between_nodes=self.between_nodes,
                 velocity_rows=True,
             )
         return self._with_velocity_rows
@@ -173,6 +198,16 @@ class Subproblem:
         ]
         i, j, v = (np.concatenate(parts) for parts in zip(*triplets))
         return sparse.csc_matrix((v, (i, j)), shape=(3 * n, self._n_variables))
+
+    def _balls(self) -> Balls:
+        """For nodes 1 ... N - 1 the pose (no entry for the last one, which is given) and rate."""
+        n = self.n_steps
+        rows = np.arange(6 * (n - 1)).reshape(n - 1, 6)
+        i = np.concatenate([rows[:-1, :3].ravel(), rows[:-1, 3:].ravel(), rows[1:, 3:].ravel()])
+        j = np.tile(self._pose_columns.ravel(), 3)
+        v = np.repeat([1.0, 1.0 / self.dt, -1.0 / self.dt], self._pose_columns.size)
+        k = sparse.csc_matrix((v, (i, j)), shape=(6 * (n - 1), self._n_variables))
+        return Balls(k, np.zeros((n - 1, 6)))
 
     def _inequality_matrix(self) -> sparse.csc_matrix:
         """Pattern of actuation (4 a node), keep-out (M a node) and velocity rows (3 a node)."""
@@ -248,21 +283,25 @@ class Subproblem:
         if not self.n_obstacles:
             return
         scenario = problem.scenario
-        centres = scenario.obstacles.centres
-        offset = reference.states[1:-2, None, :2] - centres
-        distance = np.linalg.norm(offset, axis=-1, keepdims=True)
+        centres = scenario.obstacles.centres_at(problem.node_times[:-1])
         across = np.array([problem.start[1] - problem.goal[1], problem.goal[0] - problem.start[0]])
         across = across / max(float(np.linalg.norm(across)), 1e-12)
+        relative = reference.states[:-1, None, :2] - centres
+        distance = np.linalg.norm(relative[1:-1], axis=-1, keepdims=True)
         # A reference on the very centre has no outward normal: any side will do, take the left one.
-        normal = np.where(distance > 1e-9, offset / np.maximum(distance, 1e-9), across)
+        normal = np.where(distance > 1e-9, relative[1:-1] / np.maximum(distance, 1e-9), across)
+        radii = scenario.keep_out_radii
+        if self.between_nodes:
+            radii = _widened(radii, relative)
         self._program.g.data[self._slots["keep"]] = normal.ravel()
-        self._program.h_lower[self._keep_rows] = (normal * centres).sum(
-            -1
-        ) + scenario.keep_out_radii
+        self._program.h_lower[self._keep_rows] = (normal * centres[1:-1]).sum(-1) + radii
 
     def _set_bounds(self, problem: Problem, reference: Trajectory, trust_region: float) -> None:
         poses = reference.states[1:-2, :3]
         lower, upper = poses - trust_region, poses + trust_region
+        if self._program.balls is not None:
+            lower, upper = np.full_like(poses, -np.inf), np.full_like(poses, np.inf)
+            self._set_balls(problem, reference, trust_region)
         low, high = problem.scenario.position_limits
         lower[:, :2], upper[:, :2] = np.maximum(lower[:, :2], low), np.minimum(upper[:, :2], high)
         self._program.x_lower[self._pose_columns] = lower
@@ -276,3 +315,33 @@ class Subproblem:
         centre[-1] -= problem.goal[:3] / self.dt
         self._program.h_lower[self._vel_rows] = centre - trust_region
         self._program.h_upper[self._vel_rows] = centre + trust_region
+
+    def _set_balls(self, problem: Problem, reference: Trajectory, trust_region: float) -> None:
+        balls = self._program.balls
+        assert balls is not None
+        balls.radius = trust_region
+        balls.centres[:-1, :3] = reference.states[1:-2, :3]
+        balls.centres[:, 3:] = reference.states[1:-1, 3:]
+        balls.centres[0, 3:] += problem.start[:3] / self.dt
+        balls.centres[-1, 3:] -= problem.goal[:3] / self.dt
+
+
+def _widened(radii: FloatArray, relative: FloatArray) -> FloatArray:
+    """Radii ``(N - 2, M)`` at the interior nodes that keep the segments between nodes out of discs.
+
+    A segment of length ``L`` whose ends are ``hypot(d, L / 2)`` from the centre is ``d`` from it.
+    Where the start or the goal, which are given, are nearer, its neighbour has to be so far away
+    that the given end is the segment's nearest point.
+
+    Args:
+        radii: ``(M,)`` keep-out radii in m.
+        relative: ``(N, M, 2)`` nodes of the reference in the obstacles' frames.
+    """
+    steps = np.linalg.norm(np.diff(relative, axis=0), axis=-1)
+    wide = np.hypot(radii, 0.5 * np.maximum(steps[:-1], steps[1:]))
+    for end in (0, -1) if len(wide) else ():
+        gap = np.linalg.norm(relative[end], axis=-1)
+        near = gap < np.hypot(radii, 0.5 * steps[end])
+        away = np.hypot(np.maximum(gap, radii), steps[end])
+        wide[end] = np.where(near, np.maximum(wide[end], away), wide[end])
+    return wide

@@ -87,6 +87,11 @@ class Trajectory:
         """``(N,)`` constraint indicator ``C(t_i)`` (paper, eq. 6)."""
         return constraints.violations(problem.scenario, self.states, self.controls)
 
+    def between_nodes_depth(self, problem: Problem) -> float:
+        """Largest depth inside a keep-out disc on the way between two nodes in m, or 0; exact."""
+        depth = constraints.between_nodes_depth(problem, self.states)
+        return float(np.maximum(depth, 0.0).max())
+
     def check(self, problem: Problem) -> constraints.ConstraintReport:
         """Largest violation of each family of constraints."""
         return constraints.check(problem, self.states, self.controls)

@@ -14,7 +14,7 @@ from freeflyer_env.planning import (
     solve_scp,
     straight_line,
 )
-from freeflyer_env.planning.multistart import homotopy_starts, push_out
+from freeflyer_env.planning.homotopy import homotopy_starts, push_out
 
 
 @pytest.fixture(scope="module")
