@@ -1,4 +1,4 @@
-"""Flying a plan: reference, PID tracking, pulse-width modulation."""
+"""Flying a plan: reference, PID tracking, re-planning (MPC), pulse-width modulation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ from freeflyer_env.robot import FloatArray, Robot, body_from_world
 if TYPE_CHECKING:
     import gymnasium as gym
 
+    from freeflyer_env.planning.receding_horizon import RecedingHorizon
+    from freeflyer_env.planning.scp import SCPConfig, SCPResult
     from freeflyer_env.planning.trajectory import Trajectory
+    from freeflyer_env.scenario import Problem
 
 
 class PulseWidthModulator:
@@ -58,8 +61,9 @@ def reference_at(trajectory: Trajectory, time: float) -> tuple[FloatArray, Float
 
     The plan's impulses act at the nodes; thrusters need time. The reference spreads each impulse
     evenly over the step that it begins. That is a motion with piecewise constant acceleration which
-    the thrusters can follow; it runs half a step behind the plan while that is moving, and ends in
-    the goal.
+    the thrusters can follow, half a step behind the plan: a plan from rest to rest is followed from
+    start to goal. A plan that begins in motion is to be made from where the robot will be half a
+    step later, as :class:`MPCTracker` does; one that ends in motion passes its goal that much late.
 
     Args:
         trajectory: The plan.
@@ -76,7 +80,7 @@ def reference_at(trajectory: Trajectory, time: float) -> tuple[FloatArray, Float
     tau = time - index * dt
     before, after = trajectory.states[index, 3:], trajectory.states[index + 1, 3:]
     acceleration = (after - before) / dt
-    behind = 0.5 * dt * (before - trajectory.states[0, 3:])
+    behind = 0.5 * dt * before
     pose = trajectory.states[index, :3] - behind + before * tau + 0.5 * acceleration * tau**2
     return np.concatenate([pose, before + acceleration * tau]), acceleration
 
@@ -112,6 +116,10 @@ class PIDTracker:
         """Forgets the integral of the error."""
         self._integral = np.zeros(3)
 
+    def reference(self, trajectory: Trajectory, time: float) -> FloatArray:
+        """State ``(6,)`` that the tracker wants to be in at ``time`` in s."""
+        return reference_at(trajectory, time)[0]
+
     def duties(
         self, state: FloatArray, trajectory: Trajectory, time: float, dt: float
     ) -> FloatArray:
@@ -131,6 +139,71 @@ class PIDTracker:
             wrench += acceleration * [self.robot.mass, self.robot.mass, self.robot.inertia]
         # The heading in the middle of the period, where the pulses are.
         return self.robot.allocate(body_from_world(state[2] + 0.5 * dt * state[5], wrench))
+
+
+class MPCTracker:
+    """Model-predictive control: re-plans from the measured state, PID follows the latest plan.
+
+    Args:
+        problem: The problem that is flown.
+        period: Time between re-plans in s.
+        config: Settings of SCP; default: those of :class:`RecedingHorizon`.
+        pid: Follows the plan between re-plans; default: PID with the paper's gains.
+        least_steps: With fewer steps to go the last plan is flown to its end.
+
+    Attributes:
+        results: The SCP result of every re-plan of the flight.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        period: float = 0.5,
+        config: SCPConfig | None = None,
+        pid: PIDTracker | None = None,
+        least_steps: int = 10,
+    ) -> None:
+        if not period > 0.0:
+            raise ValueError(f"MPCTracker.period must be positive, got {period}.")
+        self.problem, self.period, self.config = problem, period, config
+        self.pid, self.least_steps = pid or PIDTracker(problem.scenario.robot), least_steps
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the flight."""
+        self.pid.reset()
+        self.results: list[SCPResult] = []
+        self._horizon: RecedingHorizon | None = None
+        self._due = self.period
+
+    def reference(self, trajectory: Trajectory, time: float) -> FloatArray:
+        """State ``(6,)`` that the tracker wants to be in at ``time`` in s."""
+        plan, began = self._present(trajectory)
+        return self.pid.reference(plan, time - began)
+
+    def duties(
+        self, state: FloatArray, trajectory: Trajectory, time: float, dt: float
+    ) -> FloatArray:
+        """Thruster duties ``(8,)``; re-plans first if it is time. Arguments as for PID."""
+        from freeflyer_env.planning.receding_horizon import RecedingHorizon
+
+        if self._horizon is None:
+            self._horizon = RecedingHorizon(self.problem, trajectory, self.config, self.least_steps)
+        step = self.problem.scenario.dt
+        left = self.problem.final_time - time
+        if time > self._due - 1e-9 and left > self.least_steps * step - 1e-9:
+            # Thrusters spread each impulse over a step, half a step later on average.
+            ahead = np.array(state, dtype=np.float64)
+            ahead[:3] += 0.5 * step * ahead[3:]
+            self.results.append(self._horizon.replan(ahead, time))
+            self._due = time + self.period
+        plan, began = self._present(trajectory)
+        return self.pid.duties(state, plan, time - began, dt)
+
+    def _present(self, trajectory: Trajectory) -> tuple[Trajectory, float]:
+        if self._horizon is None or self._horizon.plan is None:
+            return trajectory, 0.0
+        return self._horizon.plan, self._horizon.planned_at
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +237,7 @@ class Flight:
 def fly(
     env: gym.Env,
     trajectory: Trajectory,
-    tracker: PIDTracker | None = None,
+    tracker: PIDTracker | MPCTracker | None = None,
     on_step: Callable[[], Any] | None = None,
 ) -> Flight:
     """Flies a plan in an environment that was just reset to the plan's problem.
@@ -198,7 +271,7 @@ def fly(
         states.append(base.state)
         contacts += info["contacts"]["count"]
         impulse += info["contacts"]["impulse"]
-        target, _ = reference_at(trajectory, time + period)
+        target = tracker.reference(trajectory, time + period)
         worst = max(worst, float(np.linalg.norm(target[:2] - states[-1][:2])))
         if on_step is not None:
             on_step()

@@ -281,6 +281,13 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         """Shows the positions of the states ``(N, 6)`` as planned path; forgotten at reset."""
         self._plan = None if states is None else np.array(states, dtype=np.float64)[:, :2]
 
+    def push(self, velocity_change: FloatArray) -> None:
+        """Changes ``(v_x, v_y, omega)`` by ``(3,)`` m/s, m/s, rad/s at once, as a bump does."""
+        change = np.asarray(velocity_change, dtype=np.float64)
+        if change.shape != (3,) or not np.isfinite(change).all():
+            raise ValueError(f"A push is three finite numbers, got {velocity_change}.")
+        self._require_world().kick(change)
+
     def _act(self, world: World, action: FloatArray) -> float:
         """Applies the action, advances the world, returns the effort in m/s."""
         robot, period = self.robot, self.control_dt

@@ -46,7 +46,7 @@ class Obstacles:
         velocities = velocities.reshape(-1, 2)
         if not len(centres) == len(radii) == len(velocities):
             raise ValueError(
-                f"Obstacles need one radius and one velocity per centre, got {len(centres)} "
+                f"Obstacles need one radius per centre, and one velocity, got {len(centres)} "
                 f"centres, {len(radii)} radii and {len(velocities)} velocities."
             )
         if not all(np.isfinite(part).all() for part in (centres, radii, velocities)):

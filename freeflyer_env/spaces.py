@@ -72,6 +72,8 @@ def require_fit(problem: Problem, base: Scenario, space: spaces.Dict) -> None:
                 f"The problem's {name} is {theirs}, the environment's {ours}: make it with "
                 "scenario=problem.scenario."
             )
+    if problem.scenario.obstacles.moving:
+        raise ValueError("The environment's obstacles are at rest; plan moving ones without it.")
     boxes: dict[str, Any] = dict(space.spaces)
     n_obstacles, room = len(problem.scenario.obstacles), boxes["obstacles"].shape[0]
     if n_obstacles > room:

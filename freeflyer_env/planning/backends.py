@@ -6,12 +6,19 @@ Which one to use when, with measured times, is in the planning guide (``docs/pla
 from __future__ import annotations
 
 import difflib
+import importlib
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
 from scipy import sparse
 
-from freeflyer_env.planning.program import ConvexProgram, Solution, SolverStatus, StandardForm
+from freeflyer_env.planning.program import (
+    ConvexProgram,
+    Solution,
+    SolverStatus,
+    StandardForm,
+    kkt_residuals,
+)
 from freeflyer_env.robot import FloatArray
 
 
@@ -127,9 +134,7 @@ class ClarabelBackend:
     cones: ClassVar[bool] = True
 
     def __init__(self) -> None:
-        import clarabel
-
-        self._clarabel = clarabel
+        self._clarabel = _import_solver("clarabel")
         self._solver: Any = None
 
     def solve(self, program: ConvexProgram) -> Solution:
@@ -171,42 +176,50 @@ class ClarabelBackend:
 
 
 class QOCOBackend:
-    """QOCO, an interior-point method with second-order cones; updated in place.
+    """QOCO, an interior-point method with second-order cones; set up anew for each program.
 
-    It does not detect infeasibility: where it does not converge, HiGHS decides, or Clarabel if
-    there are cones.
+    (Updated in place, version 0.3 calls solutions of earlier data solved.) It does not detect
+    infeasibility and is at times too easily content: where it does not converge, or the optimality
+    conditions do not hold to 1e-6, HiGHS decides, or Clarabel if there are cones.
     """
 
     cones: ClassVar[bool] = True
 
     def __init__(self) -> None:
-        try:
-            import qoco
-        except ImportError as error:
-            raise ModuleNotFoundError(
-                'This backend needs QOCO: pip install "freeflyer-gym[solvers]".'
-            ) from error
-        self._qoco = qoco
-        self._solver: Any = None
+        self._qoco = _import_solver("qoco")
+        self._form: StandardForm | None = None
 
     def solve(self, program: ConvexProgram) -> Solution:
-        if self._solver is None:
-            self._form = form = StandardForm(program)
-            self._solver = self._qoco.QOCO()
-            n, m, n_equal = len(program.c), form.matrix.shape[0], len(program.b)
-            right = form.right_hand_side(program)
-            dimension = 0 if program.balls is None else program.balls.centres.shape[1] + 1
-            cones = np.full(form.n_balls, dimension, dtype=np.int32)
-            data = (None, program.c, program.a, program.b, form.matrix, right)
-            self._solver.setup(n, m, n_equal, *data, form.n_linear, form.n_balls, cones)
-        else:
-            self._solver.update_matrix_data(G=self._form.data(program))
-            self._solver.update_vector_data(
-                c=program.c, b=program.b, h=self._form.right_hand_side(program)
+        if self._form is None:
+            self._form = StandardForm(program)
+        form, solver = self._form, self._qoco.QOCO()
+        form.matrix.data = form.data(program)
+        right = form.right_hand_side(program)
+        dimension = 0 if program.balls is None else program.balls.centres.shape[1] + 1
+        cones = np.full(form.n_balls, dimension, dtype=np.int32)
+        solver.setup(
+            len(program.c),
+            form.matrix.shape[0],
+            len(program.b),
+            None,
+            program.c,
+            program.a,
+            program.b,
+            form.matrix,
+            right,
+            form.n_linear,
+            form.n_balls,
+            cones,
+            abstol=1e-9,
+            reltol=1e-9,
+        )
+        found = solver.solve()
+        if found.status in ("QOCO_SOLVED", "QOCO_SOLVED_INACCURATE"):
+            solution = form.solution(
+                program, *(np.array(part) for part in (found.x, found.y, found.z))
             )
-        found = self._solver.solve()
-        if found.status == "QOCO_SOLVED":
-            return self._form.solution(program, *(np.array(v) for v in (found.x, found.y, found.z)))
+            if kkt_residuals(program, solution).worst < 1e-6:
+                return solution
         if program.balls is None:
             return HiGHSBackend().solve(program)
         return ClarabelBackend().solve(program)
@@ -255,6 +268,15 @@ BACKENDS: dict[str, type[Backend]] = {
 
 #: Prefix of the names that solve the CVXPY statement with one of CVXPY's solvers.
 CVXPY_PREFIX = "cvxpy:"
+
+
+def _import_solver(module: str) -> Any:
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise ModuleNotFoundError(
+            f'Backend {module!r} needs a package: pip install "freeflyer-gym[solvers]".'
+        ) from error
 
 
 def check_backend(name: str, *, cones: bool = False) -> None:

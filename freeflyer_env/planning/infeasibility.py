@@ -20,8 +20,8 @@ _UNITS = ("m/s", "m/s", "rad/s")
 def why_infeasible(problem: Problem, *, keep_out: bool = True) -> str | None:
     """Why the problem provably has no solution: which constraint, and by how much; else None.
 
-    Three families of proofs: the final time is too short for the thrusters, along an axis at any
-    heading; the start's (or the goal's) velocity carries the robot off the table; static keep-out
+    Three families of proofs: the start's (or the goal's) velocity carries the robot off the table;
+    the final time is too short for the thrusters, along an axis at any heading; static keep-out
     discs and the table's edge separate the goal from the start. The last one is about continuous
     motion: where keep-out is only imposed at the nodes, a fast robot may hop over a thin place.
 
@@ -29,7 +29,7 @@ def why_infeasible(problem: Problem, *, keep_out: bool = True) -> str | None:
         problem: The problem.
         keep_out: Whether the obstacles count (False: REL).
     """
-    reason = _too_short(problem) or _off_the_table(problem)
+    reason = _off_the_table(problem) or _too_short(problem)
     return reason or (_separated(problem) if keep_out else None)
 
 
@@ -62,6 +62,15 @@ def needed_impulses(problem: Problem, n_steps: int | None = None) -> FloatArray:
     return np.maximum(along.max(axis=0), np.abs(change) / n)
 
 
+def shortest_final_time(problem: Problem, longest: float = 1000.0) -> float | None:
+    """A lower bound in s on the final time, by :func:`needed_impulses`; None beyond ``longest``."""
+    dt, limits = problem.scenario.dt, impulse_limits(problem)
+    steps = range(2, int(longest / dt) + 1)
+    found = (n for n in steps if (needed_impulses(problem, n) <= limits * (1.0 + 1e-9)).all())
+    enough = next(found, None)
+    return None if enough is None else enough * dt
+
+
 def _too_short(problem: Problem) -> str | None:
     limits = impulse_limits(problem)
     needed = needed_impulses(problem)
@@ -69,11 +78,8 @@ def _too_short(problem: Problem) -> str | None:
     worst = int(np.argmax(excess))
     if excess[worst] <= 1.0 + 1e-9:
         return None
-    dt, n = problem.scenario.dt, problem.n_steps
-    enough = next(
-        (m for m in range(n + 1, 20 * n) if (needed_impulses(problem, m) <= limits).all()), None
-    )
-    remedy = f"at least {enough * dt:g} s needed" if enough else "no final time will do"
+    enough = shortest_final_time(problem)
+    remedy = f"at least {enough:g} s needed" if enough else "no final time will do"
     return (
         f"the final time of {problem.final_time:g} s is too short (actuation): along "
         f"{_AXES[worst]} an impulse of {needed[worst]:.3g} {_UNITS[worst]} is needed, the "

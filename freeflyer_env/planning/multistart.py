@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +35,7 @@ class MultistartResult:
 
 
 def solve_multistart(
-    problem: Problem, n_starts: int = 6, config: SCPConfig | None = None
+    problem: Problem, n_starts: int = 6, config: SCPConfig | None = None, n_jobs: int = 1
 ) -> MultistartResult:
     """SCP from REL and from up to ``n_starts - 1`` paths in distinct homotopy classes.
 
@@ -43,7 +43,9 @@ def solve_multistart(
         problem: What to solve.
         n_starts: Number of starts, at least 1; 1 is SCP from REL. Fewer are used where the
             obstacles allow fewer classes.
-        config: Settings of every SCP loop.
+        config: Settings of every SCP loop; ``reroutes`` plays no part, the starts are the routes.
+        n_jobs: Processes over which the starts are spread; worth it where one problem has to be
+            solved fast. For many problems use :func:`solve_many`.
 
     Returns:
         All results; deterministic, no random numbers are used.
@@ -53,10 +55,17 @@ def solve_multistart(
     rel = solve_rel(problem, config)
     if rel.trajectory is None or problem.defects():
         return MultistartResult(rel, (solve_scp(problem, straight_line(problem), config),), ())
+    config = replace(config or SCPConfig(), reroutes=0)
     starts = [rel.trajectory]
     if n_starts > 1:
         starts += homotopy_starts(problem, n_starts - 1)
-    results = tuple(solve_scp(problem, start, config) for start in starts)
+    if n_jobs == 1 or len(starts) == 1:
+        results = tuple(solve_scp(problem, start, config) for start in starts)
+    else:
+        import joblib
+
+        jobs = (joblib.delayed(solve_scp)(problem, start, config) for start in starts)
+        results = tuple(joblib.Parallel(n_jobs=n_jobs)(jobs))
     return MultistartResult(rel, results, distinct_optima(results))
 
 

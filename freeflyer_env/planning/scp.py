@@ -189,11 +189,14 @@ def straight_line(problem: Problem) -> Trajectory:
     return Trajectory.from_poses(problem, poses)
 
 
-def solve_rel(problem: Problem, config: SCPConfig | None = None) -> SCPResult:
-    """Solves REL, the relaxation without keep-out constraints, from the straight line.
+def solve_rel(
+    problem: Problem, config: SCPConfig | None = None, warm_start: Trajectory | None = None
+) -> SCPResult:
+    """Solves REL, the relaxation without keep-out constraints.
 
     Its cost is the paper's lower bound of the optimal cost and its trajectory the classical warm
-    start.
+    start. Where the thrusters are barely strong enough, the linearisation about the straight line,
+    the warm start by default, can be infeasible although REL is not.
     """
     began = time.perf_counter()
     free = Problem(
@@ -204,7 +207,8 @@ def solve_rel(problem: Problem, config: SCPConfig | None = None) -> SCPResult:
     )
     if defects := free.defects():
         return _failure(SCPStatus.INVALID_INPUT, began, detail="; ".join(defects))
-    return _solve(problem, straight_line(problem), config or SCPConfig(), keep_out=False)
+    start = warm_start or straight_line(problem)
+    return _solve(problem, start, config or SCPConfig(), keep_out=False)
 
 
 def solve_scp(

@@ -5,7 +5,13 @@ import numpy as np
 import pytest
 
 from freeflyer_env import HELD_OUT_SCENES, Robot, sample_problem
-from freeflyer_env.control import PIDTracker, PulseWidthModulator, fly, reference_at
+from freeflyer_env.control import (
+    MPCTracker,
+    PIDTracker,
+    PulseWidthModulator,
+    fly,
+    reference_at,
+)
 from freeflyer_env.planning import solve_multistart
 
 
@@ -91,3 +97,39 @@ def test_bad_use(planned):
         fly(env, trajectory)
     with pytest.raises(ValueError, match="three numbers >= 0"):
         PIDTracker(Robot(), kp=(1.0, -1.0, 0.0))
+
+
+def test_mpc_plans_anew_after_a_push(planned, env):
+    problem, plan = planned
+    env = gym.make(
+        "freeflyer_env:FreeFlyer-v0",
+        action_mode="thrusters",
+        scenario=problem.scenario,
+        terminate_early=False,
+    )
+    worst = {}
+    for tracker in (PIDTracker(problem.scenario.robot), MPCTracker(problem)):
+        env.reset(options={"problem": problem})
+
+        def push():
+            if abs(env.unwrapped.time - 12.0) < 1e-6:
+                env.unwrapped.push([-0.04, 0.05, 0.4])
+
+        flight = fly(env, plan, tracker, on_step=push)
+        assert flight.success
+        assert flight.final_error[0] < 1e-3
+        worst[type(tracker)] = flight.tracking_error
+    assert worst[MPCTracker] < 0.05 < worst[PIDTracker]
+    assert len(tracker.results) == 70
+    assert all(result.solved for result in tracker.results)
+    assert np.median([result.iterations for result in tracker.results]) <= 3
+    tracker.reset()
+    assert tracker.results == []
+
+
+def test_mpc_and_push_refuse_nonsense(planned, env):
+    with pytest.raises(ValueError, match="period must be positive"):
+        MPCTracker(planned[0], period=0.0)
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match="three finite numbers"):
+        env.unwrapped.push([1.0, np.nan, 0.0])

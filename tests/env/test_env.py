@@ -329,3 +329,9 @@ def test_success_is_paid_once():
     assert env.step(np.zeros(3))[1:3] == (1.0, True)
     with pytest.warns(UserWarning, match="after the episode's end"):
         assert env.step(np.zeros(3))[1] == 0.0
+
+
+def test_moving_obstacles_are_refused():
+    obstacles = Obstacles(np.array([[1.5, 1.0]]), [0.2], [[0.0, 0.1]])
+    with pytest.raises(ValueError, match="obstacles are at rest"):
+        gym.make("FreeFlyer-v0", scenario=Scenario(obstacles))

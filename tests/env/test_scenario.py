@@ -2,6 +2,8 @@
 
 import dataclasses
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -18,7 +20,7 @@ from freeflyer_env import (
     sample_problem,
     unwrap_goal,
 )
-from freeflyer_env.constraints import check, keep_out_depth, violations
+from freeflyer_env.constraints import between_nodes_depth, check, keep_out_depth, violations
 
 START, GOAL = [0.3, 1.0, 0, 0, 0, 0], [3.2, 1.2, 0, 0, 0, 0]
 EMPTY = Scenario(Obstacles.from_rows([]))
@@ -141,3 +143,39 @@ def test_robot_and_table_can_be_changed():
     low, high = big.position_limits
     np.testing.assert_allclose(low, 0.3)
     np.testing.assert_allclose(high, [3.2, 2.2])
+
+
+def test_moving_obstacles():
+    obstacles = Obstacles(np.array([[1.0, 1.0], [2.0, 1.5]]), [0.2, 0.1], [[0.1, 0.0], [0.0, -0.2]])
+    assert obstacles.moving
+    np.testing.assert_allclose(obstacles.centres_at(2.0), [[1.2, 1.0], [2.0, 1.1]])
+    assert obstacles.centres_at(np.zeros((3, 5))).shape == (3, 5, 2, 2)
+    np.testing.assert_allclose(obstacles.after(2.0).centres_at(1.0), obstacles.centres_at(3.0))
+    again = Obstacles.from_rows(obstacles.rows())
+    np.testing.assert_array_equal(again.velocities, obstacles.velocities)
+    assert Obstacles(obstacles.centres, obstacles.radii).rows().shape == (2, 3)
+    with pytest.raises(ValueError, match="got 4 numbers"):
+        Obstacles.from_rows([[1.0, 1.0, 0.2, 0.0]])
+    # A goal that is free now and covered on arrival is a defect of the problem.
+    covered = Obstacles(np.array([[3.2, 0.35]]), [0.2], [[0.0, 0.02]])
+    problem = Problem(Scenario(covered), [0.3, 1.2, 0, 0, 0, 0], [3.2, 1.2, 0, 0, 0, 0], 40.0)
+    assert "the goal is inside" in problem.defects()[0]
+    assert Problem.from_dict(problem.to_dict()).scenario.obstacles.moving
+
+
+def test_between_nodes_depth_is_that_of_dense_samples():
+    rng = np.random.default_rng(0)
+    for moving in (False, True):
+        velocities = rng.uniform(-0.1, 0.1, (4, 2)) * moving
+        base = sample_problem(rng)
+        obstacles = Obstacles(base.scenario.obstacles.centres, np.full(4, 0.2), velocities)
+        problem = Problem(replace(base.scenario, obstacles=obstacles), base.start, base.goal)
+        states = np.zeros((81, 6))
+        states[:, :2] = rng.uniform(0.5, 2.5, (81, 2))
+        exact = between_nodes_depth(problem, states)
+        share = np.linspace(0.0, 1.0, 4001)[:, None]
+        for k in range(0, 79, 13):
+            way = states[k, :2] + share * (states[k + 1, :2] - states[k, :2])
+            depth = keep_out_depth(problem.scenario, way, 0.5 * (k + share[:, 0])).max()
+            assert exact[k] == pytest.approx(depth, abs=1e-6)
+            assert exact[k] >= depth - 1e-12

@@ -5,7 +5,7 @@ import pytest
 
 from freeflyer_env import HELD_OUT_SCENES, Problem, Scenario, sample_problem
 from freeflyer_env.planning import Trajectory, solve_multistart, straight_line
-from freeflyer_env.planning.backends import SolverStatus, make_backend
+from freeflyer_env.planning.program import SolverStatus
 from freeflyer_env.planning.reference import solve_reference_subproblem
 from freeflyer_env.planning.subproblem import Subproblem
 
@@ -116,36 +116,3 @@ def test_values_are_overwritten_completely():
         assert again.status is fresh.status
         if fresh.trajectory is not None:
             assert again.trajectory.cost == pytest.approx(fresh.trajectory.cost, rel=1e-7)
-
-
-def test_backends_agree():
-    rng = np.random.default_rng(8)
-    for _ in range(4):
-        problem = sample_problem(rng, final_time=25.0)
-        line = straight_line(problem)
-        results = [
-            subproblem_for(problem, 4, backend=name).solve(problem, line, 10.0)
-            for name in ("piqp", "highs")
-        ]
-        assert len({result.status for result in results}) == 1
-        costs = [result.trajectory.cost for result in results if result.trajectory]
-        assert np.ptp(costs or [0.0]) < 1e-7
-
-
-def test_osqp_is_rough_but_not_wrong():
-    for seed in range(3):
-        problem = sample_problem(np.random.default_rng(seed), n_obstacles=0)
-        goal = problem.start + np.array([0.3, 0.1, 0.4, 0.0, 0.0, 0.0])
-        near = Problem(problem.scenario, problem.start, goal, 10.0)
-        exact, rough = (
-            subproblem_for(near, 0, backend=name).solve(near, straight_line(near), 10.0)
-            for name in ("piqp", "osqp")
-        )
-        assert rough.status is not SolverStatus.INFEASIBLE
-        if rough.trajectory is not None:
-            assert rough.trajectory.cost == pytest.approx(exact.trajectory.cost, rel=2e-3)
-
-
-def test_unknown_backend_names_the_nearest():
-    with pytest.raises(ValueError, match="Did you mean 'piqp'"):
-        make_backend("pqip")
