@@ -1,7 +1,5 @@
 """Scenes, problems, the impulsive model, the constraint check."""
 
-import dataclasses
-
 from dataclasses import replace
 
 import numpy as np
@@ -139,7 +137,7 @@ def test_keep_out_depth():
 
 
 def test_robot_and_table_can_be_changed():
-    big = dataclasses.replace(Scenario(), robot=Robot(radius=0.3))
+    big = replace(Scenario(), robot=Robot(radius=0.3))
     low, high = big.position_limits
     np.testing.assert_allclose(low, 0.3)
     np.testing.assert_allclose(high, [3.2, 2.2])
