@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     import gymnasium as gym
 
     from freeflyer_env.planning.receding_horizon import RecedingHorizon
-    from freeflyer_env.planning.scp import SCPConfig, SCPResult
+    from freeflyer_env.planning.result import SCPResult
+    from freeflyer_env.planning.scp import SCPConfig
     from freeflyer_env.planning.trajectory import Trajectory
     from freeflyer_env.scenario import Problem
 

@@ -9,14 +9,8 @@ from freeflyer_env.planning.batch import solve_many
 from freeflyer_env.planning.final_time import ParetoFront, pareto_front
 from freeflyer_env.planning.multistart import MultistartResult, solve_multistart
 from freeflyer_env.planning.receding_horizon import RecedingHorizon
-from freeflyer_env.planning.scp import (
-    SCPConfig,
-    SCPResult,
-    SCPStatus,
-    solve_rel,
-    solve_scp,
-    straight_line,
-)
+from freeflyer_env.planning.result import SCPResult, SCPStatus
+from freeflyer_env.planning.scp import SCPConfig, solve_rel, solve_scp, straight_line
 from freeflyer_env.planning.trajectory import Trajectory, to_go
 
 __all__ = [

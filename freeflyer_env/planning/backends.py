@@ -107,8 +107,13 @@ class HiGHSBackend:
         if self._basis is not None:
             self._solver.setBasis(self._basis)
         self._solver.run()
-        status = self._solver.getModelStatus()
-        if status == self._highspy.HighsModelStatus.kOptimal:
+        status, kinds = self._solver.getModelStatus(), self._highspy.HighsModelStatus
+        infeasible = (kinds.kInfeasible, kinds.kUnboundedOrInfeasible)
+        if status not in (kinds.kOptimal, *infeasible):
+            self._solver.clearSolver()  # a basis of another program can lead astray
+            self._solver.run()
+            status = self._solver.getModelStatus()
+        if status == kinds.kOptimal:
             found = self._solver.getSolution()
             self._basis = self._solver.getBasis()
             rows = -np.asarray(found.row_dual)
@@ -120,10 +125,6 @@ class HiGHSBackend:
                 -np.asarray(found.col_dual),
                 np.empty((0, 0)),
             )
-        infeasible = (
-            self._highspy.HighsModelStatus.kInfeasible,
-            self._highspy.HighsModelStatus.kUnboundedOrInfeasible,
-        )
         failed = SolverStatus.INFEASIBLE if status in infeasible else SolverStatus.FAILED
         return Solution.unsolved(failed)
 

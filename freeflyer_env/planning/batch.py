@@ -8,7 +8,8 @@ from typing import Any, overload
 import numpy as np
 
 from freeflyer_env.planning.multistart import MultistartResult, solve_multistart
-from freeflyer_env.planning.scp import SCPConfig, SCPResult, SCPStatus, solve_scp
+from freeflyer_env.planning.result import SCPResult, SCPStatus
+from freeflyer_env.planning.scp import SCPConfig, solve_scp
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.scenario import Problem
 

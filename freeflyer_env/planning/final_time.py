@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from freeflyer_env.planning.infeasibility import shortest_final_time
-from freeflyer_env.planning.scp import SCPConfig, SCPResult, solve_rel, solve_scp
+from freeflyer_env.planning.result import SCPResult
+from freeflyer_env.planning.scp import SCPConfig, solve_rel, solve_scp
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem
@@ -155,7 +156,7 @@ class _Sweep:
         if neighbour is not None and self.results[neighbour].solved:
             solution = self.results[neighbour].trajectory
             assert solution is not None
-            starts.append(_stretched(problem, solution))
+            starts.append(solution.stretched(problem))
         for start in starts:
             result = solve_scp(problem, start, self.config)
             if time not in self.results or result.cost < self.results[time].cost:
@@ -174,13 +175,3 @@ class _Sweep:
                 return
             middle = dt * round(0.5 * (solved[0] + failed[-1]) / dt)
             self.solve(middle, solved[0])
-
-
-def _stretched(problem: Problem, solution: Trajectory) -> Trajectory:
-    """A solution of another final time as a warm start: the same path in this problem's time."""
-    share = np.linspace(0.0, 1.0, solution.n_steps)
-    poses = [
-        np.interp(np.linspace(0.0, 1.0, problem.n_steps), share, solution.states[:-1, axis])
-        for axis in range(3)
-    ]
-    return Trajectory.from_poses(problem, np.column_stack(poses))

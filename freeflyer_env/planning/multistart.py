@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from freeflyer_env.planning.homotopy import homotopy_starts
-from freeflyer_env.planning.scp import SCPConfig, SCPResult, solve_rel, solve_scp, straight_line
+from freeflyer_env.planning.result import SCPResult
+from freeflyer_env.planning.scp import SCPConfig, solve_rel, solve_scp, straight_line
 from freeflyer_env.scenario import Problem
 
 #: Two optima are the same if their costs and positions agree to these (m/s, m).

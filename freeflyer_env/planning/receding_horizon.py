@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from freeflyer_env.planning.homotopy import push_out
-from freeflyer_env.planning.scp import SCPConfig, SCPResult, solve_scp
+from freeflyer_env.planning.result import SCPResult
+from freeflyer_env.planning.scp import SCPConfig, solve_scp
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem

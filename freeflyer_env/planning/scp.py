@@ -10,7 +10,6 @@ homotopy classes as warm starts where the given one leads nowhere (``reroutes``)
 
 from __future__ import annotations
 
-import enum
 import threading
 import time
 from collections import OrderedDict
@@ -20,12 +19,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, ConstraintReport
+from freeflyer_env.constraints import FEASIBILITY_TOLERANCE
 from freeflyer_env.constraints import check as check_constraints
 from freeflyer_env.planning.backends import CVXPY_PREFIX, check_backend
 from freeflyer_env.planning.homotopy import homotopy_starts
 from freeflyer_env.planning.infeasibility import why_infeasible
 from freeflyer_env.planning.program import KKTResiduals, SolverStatus
+from freeflyer_env.planning.result import SCPResult, SCPStatus
 from freeflyer_env.planning.subproblem import Subproblem
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.scenario import Obstacles, Problem
@@ -36,45 +36,6 @@ if TYPE_CHECKING:
 #: Price of a metre of slack at a node in multiples of the largest delta-V: first, growth at each
 #: use, last. The last one is above the keep-out multipliers seen, so slack is used only at need.
 _FIRST_PRICE, _PRICE_GROWTH, _LAST_PRICE = 5.0, 10.0, 50_000.0
-
-
-class SCPStatus(enum.Enum):
-    """How SCP ended; :attr:`remedy` says what a user can do about it."""
-
-    SOLVED = "solved"
-    ITERATION_LIMIT = "iteration_limit"
-    INFEASIBLE_SUBPROBLEM = "infeasible_subproblem"
-    INFEASIBLE_PROBLEM = "infeasible_problem"
-    SLACK_LEFT = "slack_left"
-    NUMERICAL_FAILURE = "numerical_failure"
-    INVALID_INPUT = "invalid_input"
-
-    @property
-    def remedy(self) -> str:
-        """One line: what this status means and what to try."""
-        return _REMEDIES[self]
-
-
-_REMEDIES = {
-    SCPStatus.SOLVED: "Converged, and every constraint imposed was verified independently.",
-    SCPStatus.ITERATION_LIMIT: (
-        "Not converged within the iteration limit; raise SCPConfig.max_iterations or try another "
-        "warm start."
-    ),
-    SCPStatus.INFEASIBLE_SUBPROBLEM: (
-        "The problem linearised about this warm start has no solution; try SCPConfig.robust(), "
-        "another warm start (solve_multistart) or a longer final time."
-    ),
-    SCPStatus.INFEASIBLE_PROBLEM: "The problem provably has no solution; change the problem.",
-    SCPStatus.SLACK_LEFT: (
-        "Settled on a trajectory that is still inside a keep-out disc; allow more "
-        "SCPConfig.reroutes, or a longer final time."
-    ),
-    SCPStatus.NUMERICAL_FAILURE: (
-        "The solver gave up on a subproblem; try another warm start or another backend."
-    ),
-    SCPStatus.INVALID_INPUT: "The problem as posed cannot be solved; correct the input.",
-}
 
 
 @dataclass(frozen=True)
@@ -96,6 +57,7 @@ class SCPConfig:
             ending the loop. The answer counts as solved only without slack.
         reroutes: How many other homotopy classes are tried, shortest path first, where the warm
             start leads to no solution. With ``elastic``, slack is the last resort then.
+        time_limit: In s; no subproblem is begun after it, the running one is finished.
     """
 
     backend: str = "piqp"
@@ -108,6 +70,7 @@ class SCPConfig:
     between_nodes: bool = False
     elastic: bool = False
     reroutes: int = 0
+    time_limit: float = np.inf
 
     @classmethod
     def robust(cls, **settings: Any) -> SCPConfig:
@@ -133,7 +96,7 @@ class SCPConfig:
                 "SCPConfig needs 0 < trust_region_end <= trust_region_start, got "
                 f"{self.trust_region_end} and {self.trust_region_start}."
             )
-        for name in ("state_tolerance", "cost_tolerance"):
+        for name in ("state_tolerance", "cost_tolerance", "time_limit"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"SCPConfig.{name} must be positive, got {getattr(self, name)}.")
 
@@ -142,44 +105,6 @@ class SCPConfig:
         share = iteration / (self.max_iterations - 1)
         ratio = self.trust_region_end / self.trust_region_start
         return float(self.trust_region_start * ratio**share)
-
-
-@dataclass(frozen=True, eq=False)
-class SCPResult:
-    """What SCP found.
-
-    Attributes:
-        status: How it ended.
-        trajectory: The last iterate, or None if no subproblem was solved.
-        iterations: Number of subproblems solved (failing ones and those of reroutes included).
-        cost_history: Cost of each iterate of the last route.
-        solve_time: Wall time in s, all in.
-        report: Independent check of ``trajectory``, or None.
-        message: One line for people: what the status means and what to do about it.
-        kkt: Residuals of the optimality conditions of the last subproblem if solved, else None
-            (also for ``cvxpy:`` backends).
-        rerouted: Number of further attempts, from other homotopy classes or with slack.
-    """
-
-    status: SCPStatus
-    trajectory: Trajectory | None
-    iterations: int
-    cost_history: tuple[float, ...]
-    solve_time: float
-    report: ConstraintReport | None
-    message: str
-    kkt: KKTResiduals | None = None
-    rerouted: int = 0
-
-    @property
-    def solved(self) -> bool:
-        """Whether the trajectory is a verified local optimum."""
-        return self.status is SCPStatus.SOLVED
-
-    @property
-    def cost(self) -> float:
-        """Cost of the solution, infinite unless solved."""
-        return self.trajectory.cost if self.solved and self.trajectory else np.inf
 
 
 def straight_line(problem: Problem) -> Trajectory:
@@ -231,11 +156,11 @@ def solve_scp(
         return _failure(SCPStatus.INVALID_INPUT, began, detail="; ".join(defects))
     if warm_start is None:
         rel = solve_rel(problem, config)
-        if rel.trajectory is None and (
-            rel.status is SCPStatus.INFEASIBLE_PROBLEM or not config.reroutes
-        ):
+        warm_start = rel.trajectory
+        if warm_start is None and config.reroutes and not rel.status.hopeless:
+            warm_start = _rel_of_longer(problem, config)
+        if warm_start is None:
             return rel
-        warm_start = rel.trajectory or straight_line(problem)
     if (warm_start.n_steps, warm_start.dt) != (problem.n_steps, problem.scenario.dt):
         detail = (
             f"the warm start has {warm_start.n_steps} steps of {warm_start.dt} s, "
@@ -245,10 +170,10 @@ def solve_scp(
     if not (np.isfinite(warm_start.states).all() and np.isfinite(warm_start.controls).all()):
         return _failure(SCPStatus.INVALID_INPUT, began, detail="the warm start is not finite")
     attempts: list[SCPResult] = []
-    for start, elastic in _routes(problem, warm_start, config):
-        attempt = replace(config, elastic=elastic)
-        attempts.append(_solve(problem, start, attempt, keep_out=True, began=began))
-        if attempts[-1].solved or attempts[-1].status is SCPStatus.INFEASIBLE_PROBLEM:
+    for start, settings in _routes(problem, warm_start, config, attempts):
+        attempts.append(_solve(problem, start, settings, keep_out=True, began=began))
+        status = attempts[-1].status
+        if attempts[-1].solved or status.hopeless or status is SCPStatus.TIME_LIMIT:
             result = attempts[-1]
             break
     else:
@@ -259,20 +184,52 @@ def solve_scp(
 
 
 def _routes(
-    problem: Problem, warm_start: Trajectory, config: SCPConfig
-) -> Iterator[tuple[Trajectory, bool]]:
-    """Warm starts in the order in which they are tried, and whether with slack.
+    problem: Problem, warm_start: Trajectory, config: SCPConfig, attempts: list[SCPResult]
+) -> Iterator[tuple[Trajectory, SCPConfig]]:
+    """Warm starts, and settings for each, in the order in which they are tried.
 
-    Slack costs many iterations, so every route is tried without it first.
+    Slack costs many iterations and helps rarely, so it comes last, on the best three routes. A loop
+    that stayed feasible without settling jumps between vertices of nearly the same cost; it is
+    continued in a small trust region.
+
+    Args:
+        problem: What to solve.
+        warm_start: The first one.
+        config: What the user asked for.
+        attempts: Results so far; the caller adds each one before it asks for the next route.
     """
     if not config.reroutes:
-        yield warm_start, config.elastic
+        yield warm_start, config
         return
-    yield warm_start, False
-    others = homotopy_starts(problem, config.reroutes)
-    yield from ((other, False) for other in others)
+    hard = replace(config, elastic=False)
+    end = config.trust_region_end
+    small = replace(
+        hard,
+        trust_region_start=min(10.0 * end, config.trust_region_start),
+        trust_region_end=0.1 * end,
+    )
+    routes = [warm_start]
+    for index in range(1 + config.reroutes):
+        if index == 1:
+            routes += homotopy_starts(problem, config.reroutes)
+        if index >= len(routes):
+            break
+        yield routes[index], hard
+        last = attempts[-1]
+        if last.status is SCPStatus.ITERATION_LIMIT and last.feasible and last.trajectory:
+            yield last.trajectory, small
     if config.elastic:
-        yield from ((start, True) for start in [warm_start, *others])
+        yield from ((route, config) for route in routes[:3])
+
+
+def _rel_of_longer(problem: Problem, config: SCPConfig) -> Trajectory | None:
+    """REL of a longer final time in this problem's time, where REL itself is hard to linearise."""
+    for factor in (1.2, 1.6):
+        final_time = problem.scenario.dt * round(factor * problem.n_steps)
+        rel = solve_rel(replace(problem, final_time=final_time), config)
+        if rel.trajectory is not None:
+            return rel.trajectory.stretched(problem)
+    return None
 
 
 def _depth(result: SCPResult) -> float:
@@ -291,25 +248,27 @@ def _solve(
     began = time.perf_counter() if began is None else began
     subproblem = _subproblem(problem, keep_out, config)
     soften = config.elastic and keep_out
-    price = _FIRST_PRICE
+    price, slack, iterations = _FIRST_PRICE, 0.0, 0
     costs: list[float] = []
     trajectory: Trajectory | None = None
+    kkt: KKTResiduals | None = None
     status = SCPStatus.ITERATION_LIMIT
-    solved_by: Subproblem | ReferenceSubproblem | None = None
     for iteration in range(config.max_iterations):
-        trust_region = config.trust_region(iteration)
-        solved_by = subproblem
-        solution = subproblem.solve(problem, reference, trust_region)
+        if time.perf_counter() - began > config.time_limit:
+            status = SCPStatus.TIME_LIMIT
+            break
+        iterations, trust_region, solver = iteration + 1, config.trust_region(iteration), subproblem
+        solution = solver.solve(problem, reference, trust_region)
         softened = solution.trajectory is None and soften
         if softened:
-            solved_by = _subproblem(problem, keep_out, config, elastic=True)
-            solution = solved_by.solve(problem, reference, trust_region, price)
+            solver = _subproblem(problem, keep_out, config, elastic=True)
+            solution = solver.solve(problem, reference, trust_region, price)
             price = min(price * _PRICE_GROWTH, _LAST_PRICE)
         if solution.trajectory is None:
             infeasible = solution.status is SolverStatus.INFEASIBLE
             status = SCPStatus.INFEASIBLE_SUBPROBLEM if infeasible else SCPStatus.NUMERICAL_FAILURE
             break
-        trajectory = solution.trajectory
+        trajectory, slack = solution.trajectory, solution.slack
         costs.append(trajectory.cost)
         moved = np.linalg.norm(trajectory.states - reference.states, axis=1).max()
         reference = trajectory
@@ -318,20 +277,19 @@ def _solve(
         if abs(costs[-1] - costs[-2]) >= config.cost_tolerance:
             continue
         if _verified(problem, trajectory, keep_out, config.between_nodes):
-            status = SCPStatus.SOLVED
+            status, kkt = SCPStatus.SOLVED, solver.kkt_residuals()
             break
         if softened and price == _LAST_PRICE:
             break  # settled with slack left: more iterations would only pay for it again
-    if status is SCPStatus.ITERATION_LIMIT and solution.slack > FEASIBILITY_TOLERANCE:
+    if status is SCPStatus.ITERATION_LIMIT and slack > FEASIBILITY_TOLERANCE:
         status = SCPStatus.SLACK_LEFT
-    kkt = solved_by.kkt_residuals() if solved_by and status is SCPStatus.SOLVED else None
     message = status.remedy
     if status is not SCPStatus.SOLVED and (reason := why_infeasible(problem, keep_out=keep_out)):
         status = SCPStatus.INFEASIBLE_PROBLEM
         message = f"{status.remedy[:-1]}: {reason}."
     report = trajectory.check(problem) if trajectory else None
     elapsed = time.perf_counter() - began
-    return SCPResult(status, trajectory, iteration + 1, tuple(costs), elapsed, report, message, kkt)
+    return SCPResult(status, trajectory, iterations, tuple(costs), elapsed, report, message, kkt)
 
 
 def _verified(

@@ -65,6 +65,13 @@ class Trajectory:
             controls = np.diff(rates, axis=0) / robot.control_gain
         return cls(states, controls, dt)
 
+    def stretched(self, problem: Problem) -> Trajectory:
+        """The same path in another problem's time, between its start and goal: a warm start."""
+        share = np.linspace(0.0, 1.0, self.n_steps)
+        at = np.linspace(0.0, 1.0, problem.n_steps)
+        poses = [np.interp(at, share, self.states[:-1, axis]) for axis in range(3)]
+        return Trajectory.from_poses(problem, np.column_stack(poses))
+
     @property
     def n_steps(self) -> int:
         return len(self.controls)
