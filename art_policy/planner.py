@@ -7,7 +7,7 @@ environment.
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
 #: A warm start this deep inside a keep-out disc (m) is not worth refining.
 _DEEPEST_WARM_START = 0.1
 
+#: Homotopy classes tried where the model's proposals and REL lead nowhere.
+_REROUTES = 12
+
 _REL_ROLES = ("fallback", "portfolio", "never")
 
 
@@ -41,7 +44,8 @@ class PlannerConfig:
         n_candidates: How many of the model's proposals are refined; the cheapest result is kept.
         rel: What becomes of REL, the classical warm start: ``"fallback"``, refined if no candidate
             leads to a feasible plan; ``"portfolio"``, always refined too, so that the plan is never
-            worse than REL + SCP; ``"never"``, to see what the model does alone.
+            worse than REL + SCP; ``"never"``, to see what the model does alone. Unless ``"never"``,
+            other homotopy classes are the last resort where REL fails, too.
         scp: Settings of the SCP loop.
     """
 
@@ -65,7 +69,8 @@ class Plan:
     Attributes:
         result: The chosen SCP result; ``result.solved`` says whether it can be flown.
         warm_start: The reference that SCP started from.
-        source: ``"art"`` or ``"rel"``: where the chosen warm start came from.
+        source: Where the chosen warm start came from: ``"art"``, ``"rel"``, or ``"reroute"``,
+            another homotopy class.
         timings: Wall times in s: ``propose``, ``rel``, ``scp`` and ``total``.
         iterations: Subproblems solved by all refinements; those of REL itself are not counted.
         monitor: What the monitor distrusted or had to replace, one line each; empty if nothing.
@@ -119,6 +124,8 @@ class WarmStartPlanner:
             or (role == "fallback" and not search.any_solved)
         ):
             search.refine_rel()
+        if self.model is not None and role != "never" and not search.any_solved:
+            search.reroute()
         return search.finish()
 
     def _try_model(self, search: _Search) -> None:
@@ -176,6 +183,17 @@ class _Search:
             self.monitor.append(f"REL: {rel.status.value}")
         else:
             self.refine(rel.trajectory, "rel", "REL")
+
+    def reroute(self) -> None:
+        """The last resort: other homotopy classes, and slack on keep-out."""
+        rel = self.solve_rel()
+        start = rel.trajectory or straight_line(self.problem)
+        config = replace(self.config.scp, elastic=True, reroutes=_REROUTES)
+        result = solve_scp(self.problem, rel.trajectory, config)
+        self.timings["scp"] += result.solve_time
+        self.attempts.append(("reroute", start, result))
+        if not result.solved:
+            self.monitor.append(f"reroute: {result.status.value}")
 
     def finish(self) -> Plan:
         source, warm_start, result = min(self.attempts, key=lambda attempt: attempt[2].cost)
