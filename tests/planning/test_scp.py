@@ -212,6 +212,33 @@ def test_any_number_of_obstacles_and_any_final_time(n_obstacles, final_time):
     assert result.trajectory.check(problem).satisfied()
 
 
+def test_vertices_of_nearly_the_same_cost_are_left_behind():
+    problem = sample_problem(np.random.default_rng(12), final_time=23.5, n_obstacles=0)
+    plain = solve_scp(problem)
+    assert plain.status is SCPStatus.ITERATION_LIMIT
+    assert plain.feasible
+    assert plain.cost == np.inf
+    settled = solve_scp(problem, config=SCPConfig.robust())
+    assert settled.solved
+    assert settled.cost == pytest.approx(plain.cost_history[-1], rel=1e-3)
+
+
+def test_rel_that_is_hard_to_linearise_is_reached_from_a_longer_time():
+    problem = sample_problem(np.random.default_rng(43), final_time=21.0, n_obstacles=0)
+    assert solve_rel(problem).status is SCPStatus.INFEASIBLE_SUBPROBLEM
+    found = solve_scp(problem, config=SCPConfig.robust())
+    assert found.solved
+    assert solve_rel(problem, warm_start=found.trajectory).trajectory is not None
+
+
+def test_a_time_limit_is_kept():
+    problem = sample_problem(np.random.default_rng(2), final_time=100.0)
+    result = solve_scp(problem, config=SCPConfig(time_limit=1e-6))
+    assert result.status is SCPStatus.TIME_LIMIT
+    assert result.trajectory is None
+    assert "time_limit" in result.message
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
@@ -220,6 +247,7 @@ def test_any_number_of_obstacles_and_any_final_time(n_obstacles, final_time):
         ({"trust_region_end": 20.0}, "trust_region_end <= trust_region_start"),
         ({"state_tolerance": 0.0}, "state_tolerance must be positive"),
         ({"reroutes": -1}, "reroutes must not be negative"),
+        ({"time_limit": 0.0}, "time_limit must be positive"),
     ],
 )
 def test_bad_settings(settings, message):
