@@ -66,8 +66,7 @@ class PIQPBackend:
         if status == self._piqp.PIQP_PRIMAL_INFEASIBLE:
             return Solution.unsolved(SolverStatus.INFEASIBLE)
         if status != self._piqp.PIQP_SOLVED:
-            # Rare, and mostly a program that is infeasible by a hair: the simplex method decides.
-            return HiGHSBackend().solve(program)
+            return _judge(program)  # rare, and mostly a program that is infeasible by a hair
         found = self._solver.result
         z, w = found.z_u - found.z_l, found.z_bu - found.z_bl
         return Solution(SolverStatus.SOLVED, found.x, found.y, z, w, np.empty((0, 0)))
@@ -76,18 +75,23 @@ class PIQPBackend:
 class HiGHSBackend:
     """HiGHS, the dual simplex method; starts from the basis of the program solved last.
 
-    Exact about infeasibility. Where a program has several optima, which one it gives may depend on
-    the programs solved before.
+    Exact about infeasibility; some degenerate infeasible programs are beyond it. Where a program
+    has several optima, which one it gives may depend on the programs solved before.
+
+    Args:
+        time_limit: In s, for all solves together.
     """
 
     cones: ClassVar[bool] = False
 
-    def __init__(self) -> None:
+    def __init__(self, time_limit: float = np.inf) -> None:
         import highspy
 
         self._highspy = highspy
         self._solver = highspy.Highs()
-        for option, value in (("output_flag", False), ("solver", "simplex"), ("threads", 1)):
+        options: dict[str, Any] = {"output_flag": False, "solver": "simplex", "threads": 1}
+        options["time_limit"] = time_limit
+        for option, value in options.items():
             self._solver.setOptionValue(option, value)
         self._basis: Any = None
 
@@ -109,7 +113,7 @@ class HiGHSBackend:
         self._solver.run()
         status, kinds = self._solver.getModelStatus(), self._highspy.HighsModelStatus
         infeasible = (kinds.kInfeasible, kinds.kUnboundedOrInfeasible)
-        if status not in (kinds.kOptimal, *infeasible):
+        if status not in (kinds.kOptimal, *infeasible) and self._basis is not None:
             self._solver.clearSolver()  # a basis of another program can lead astray
             self._solver.run()
             status = self._solver.getModelStatus()
@@ -134,7 +138,8 @@ class ClarabelBackend:
 
     cones: ClassVar[bool] = True
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_judge: bool = False) -> None:
+        self._is_judge = is_judge
         self._clarabel = _import_solver("clarabel")
         self._solver: Any = None
 
@@ -167,8 +172,8 @@ class ClarabelBackend:
             return self._form.solution(program, x, z[:n_equal], z[n_equal:])
         if found.status == clarabel.SolverStatus.PrimalInfeasible:
             return Solution.unsolved(SolverStatus.INFEASIBLE)
-        if program.balls is None:
-            return HiGHSBackend().solve(program)
+        if program.balls is None and not self._is_judge:
+            return _judge(program)
         infeasible = found.status == clarabel.SolverStatus.AlmostPrimalInfeasible
         return Solution.unsolved(SolverStatus.INFEASIBLE if infeasible else SolverStatus.FAILED)
 
@@ -221,9 +226,7 @@ class QOCOBackend:
             )
             if kkt_residuals(program, solution).worst < 1e-6:
                 return solution
-        if program.balls is None:
-            return HiGHSBackend().solve(program)
-        return ClarabelBackend().solve(program)
+        return _judge(program)
 
 
 class OSQPBackend:
@@ -256,6 +259,15 @@ class OSQPBackend:
             return Solution(SolverStatus.SOLVED, np.asarray(found.x), y, z, w, np.empty((0, 0)))
         infeasible = "infeasible" in found.info.status
         return Solution.unsolved(SolverStatus.INFEASIBLE if infeasible else SolverStatus.FAILED)
+
+
+def _judge(program: ConvexProgram) -> Solution:
+    """Solves a program that a backend was not sure about: the simplex method, else Clarabel."""
+    if program.balls is None:
+        solution = HiGHSBackend(time_limit=1.0).solve(program)
+        if solution.status is not SolverStatus.FAILED:
+            return solution
+    return ClarabelBackend(is_judge=True).solve(program)
 
 
 #: Backends by name. A name ``cvxpy:<SOLVER>`` is none of these: the reference statement is solved.

@@ -110,7 +110,7 @@ def pareto_front(
         problem: Start, goal and scene.
         final_times: In s, multiples of the step. None: sixteen from the shortest that the thrusters
             might allow to twice the problem's own.
-        config: Settings of every SCP loop.
+        config: Settings of every SCP loop; default: three reroutes.
 
     Returns:
         The front. Final times without a solution are in it, with the reason in their result.
@@ -121,7 +121,7 @@ def pareto_front(
         longest = max(2.0 * problem.final_time, shortest + 16 * dt)
         steps = np.unique(np.rint(np.geomspace(shortest, longest, 16) / dt))
         final_times = [float(dt * count) for count in steps]
-    sweep = _Sweep(problem, config or SCPConfig())
+    sweep = _Sweep(problem, config or SCPConfig(reroutes=3))
     times = sorted({float(time) for time in final_times})
     if not times:
         raise ValueError("pareto_front needs at least one final time.")

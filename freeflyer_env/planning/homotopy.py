@@ -49,7 +49,7 @@ def homotopy_starts(problem: Problem, n_starts: int) -> list[Trajectory]:
 
 
 def warm_start_along(problem: Problem, path: FloatArray) -> Trajectory:
-    """A warm start along ``path`` ``(P, 2)``: trapezoidal speed, uniform turn, zero controls."""
+    """A warm start along ``path`` ``(P, 2)``: trapezoidal speed and turn rate, zero controls."""
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     arc = np.concatenate([[0.0], np.cumsum(lengths)])
     share = _trapezoid(problem.n_steps)

@@ -95,8 +95,8 @@ def _off_the_table(problem: Problem) -> str | None:
     for name, state, sense in (("start", problem.start, 1.0), ("goal", problem.goal, -1.0)):
         for axis in range(2):
             position, velocity = state[axis], sense * state[3 + axis]
-            # Forwards the first impulse acts before the first drift; backwards after it.
-            brake = limits[axis] * dt * (k * (k + 1) if sense > 0 else k * (k - 1)) / 2
+            # The first impulse acts before the first drift; seen backwards the last one does, too.
+            brake = limits[axis] * dt * k * (k + 1) / 2
             over = (position + velocity * k * dt - brake - high[axis]).max(initial=-np.inf)
             under = (low[axis] - position - velocity * k * dt - brake).max(initial=-np.inf)
             if max(over, under) > 1e-6:
@@ -149,7 +149,7 @@ def _separated(problem: Problem) -> str | None:
                 elif parity[there] != odd:
                     return (
                         "the goal is cut off from the start (keep-out): the keep-out discs, with "
-                        "the edge of the table, leave no gap; move an obstacle"
+                        "the edge of the table, leave no gap to move through; move an obstacle"
                     )
     return None
 

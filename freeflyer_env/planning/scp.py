@@ -132,8 +132,12 @@ def solve_rel(
     )
     if defects := free.defects():
         return _failure(SCPStatus.INVALID_INPUT, began, detail="; ".join(defects))
-    start = warm_start or straight_line(problem)
-    return _solve(problem, start, config or SCPConfig(), keep_out=False)
+    config, start = config or SCPConfig(), warm_start or straight_line(problem)
+    result = _solve(problem, start, config, keep_out=False)
+    if config.reroutes and _unsettled(result, keep_out=False) and result.trajectory:
+        again = _solve(problem, result.trajectory, _in_small(config), keep_out=False, began=began)
+        result = replace(again, iterations=result.iterations + again.iterations)
+    return result
 
 
 def solve_scp(
@@ -177,7 +181,7 @@ def solve_scp(
             result = attempts[-1]
             break
     else:
-        result = min(attempts, key=_depth)
+        result = min(attempts, key=_violation)
     iterations = sum(attempt.iterations for attempt in attempts)
     elapsed = time.perf_counter() - began
     return replace(result, iterations=iterations, rerouted=len(attempts) - 1, solve_time=elapsed)
@@ -202,12 +206,6 @@ def _routes(
         yield warm_start, config
         return
     hard = replace(config, elastic=False)
-    end = config.trust_region_end
-    small = replace(
-        hard,
-        trust_region_start=min(10.0 * end, config.trust_region_start),
-        trust_region_end=0.1 * end,
-    )
     routes = [warm_start]
     for index in range(1 + config.reroutes):
         if index == 1:
@@ -216,8 +214,8 @@ def _routes(
             break
         yield routes[index], hard
         last = attempts[-1]
-        if last.status is SCPStatus.ITERATION_LIMIT and last.feasible and last.trajectory:
-            yield last.trajectory, small
+        if _unsettled(last, keep_out=True) and last.trajectory:
+            yield last.trajectory, _in_small(hard)
     if config.elastic:
         yield from ((route, config) for route in routes[:3])
 
@@ -232,9 +230,23 @@ def _rel_of_longer(problem: Problem, config: SCPConfig) -> Trajectory | None:
     return None
 
 
-def _depth(result: SCPResult) -> float:
-    """Orders failures: how deep the trajectory is inside keep-out discs."""
-    return result.report.keep_out if result.report else np.inf
+def _unsettled(result: SCPResult, *, keep_out: bool) -> bool:
+    """Whether a loop ended without convergence, but on a trajectory that satisfies everything."""
+    if result.status is not SCPStatus.ITERATION_LIMIT or result.report is None:
+        return False
+    return (result.report if keep_out else replace(result.report, keep_out=0.0)).satisfied()
+
+
+def _in_small(config: SCPConfig) -> SCPConfig:
+    """The settings with a small trust region, in which an unsettled loop is continued."""
+    end = config.trust_region_end
+    start = min(10.0 * end, config.trust_region_start)
+    return replace(config, trust_region_start=start, trust_region_end=0.1 * end)
+
+
+def _violation(result: SCPResult) -> float:
+    """Orders failures: by how much the trajectory violates a constraint."""
+    return result.report.worst[1] if result.report else np.inf
 
 
 def _solve(
@@ -248,7 +260,7 @@ def _solve(
     began = time.perf_counter() if began is None else began
     subproblem = _subproblem(problem, keep_out, config)
     soften = config.elastic and keep_out
-    price, slack, iterations = _FIRST_PRICE, 0.0, 0
+    price, slack, iterations = 0.0, 0.0, 0
     costs: list[float] = []
     trajectory: Trajectory | None = None
     kkt: KKTResiduals | None = None
@@ -262,8 +274,8 @@ def _solve(
         softened = solution.trajectory is None and soften
         if softened:
             solver = _subproblem(problem, keep_out, config, elastic=True)
+            price = min(price * _PRICE_GROWTH, _LAST_PRICE) if price else _FIRST_PRICE
             solution = solver.solve(problem, reference, trust_region, price)
-            price = min(price * _PRICE_GROWTH, _LAST_PRICE)
         if solution.trajectory is None:
             infeasible = solution.status is SolverStatus.INFEASIBLE
             status = SCPStatus.INFEASIBLE_SUBPROBLEM if infeasible else SCPStatus.NUMERICAL_FAILURE

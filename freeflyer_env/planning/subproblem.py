@@ -143,7 +143,7 @@ class Subproblem:
     def kkt_residuals(self) -> KKTResiduals:
         """How exactly the program solved last satisfies its optimality conditions.
 
-        Units: largest delta-V for the objective and the actuation rows, m and rad elsewhere.
+        Units: largest delta-V for objective, dynamics and actuation rows; SI units elsewhere.
         """
         program = self._program
         if self._with_velocity_rows and self._solution is self._with_velocity_rows._solution:

@@ -82,6 +82,15 @@ def test_a_start_that_cannot_brake():
     assert "goal's velocity" in why_infeasible(Problem(scene(), START, goal, 40.0))
 
 
+def test_braking_in_the_last_step_counts():
+    # The last impulse stops the drift towards the goal, as the first one stops the start's.
+    goal = np.array([3.35, 1.2, 0, -0.01, 0, 0])
+    start = np.array([0.15, 1.2, 0, -0.01, 0, 0])
+    for problem in (Problem(scene(), START, goal), Problem(scene(), start, GOAL)):
+        assert solve_scp(problem).solved
+        assert why_infeasible(problem) is None
+
+
 def test_a_goal_that_is_cut_off():
     wall = [[1.75, y, 0.2] for y in (0.3, 0.95, 1.6, 2.25)]
     problem = Problem(scene(*wall), START, GOAL)
