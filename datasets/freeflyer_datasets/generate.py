@@ -1,15 +1,18 @@
 """Generation: solves a recipe's problems in parallel and writes them as shards.
 
 A shard's bytes depend on the recipe alone: not on the number of workers, their order, an
-interruption, or how many problems were asked for. Starting an interrupted run again resumes it.
+interruption, or how many problems were asked for. Starting an interrupted run again resumes it: at
+most the shards that were in work are lost.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import logging
 import os
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,8 +39,21 @@ logger = logging.getLogger(__name__)
 
 _UNSOLVED = "the relaxed problem was not solved"
 
+#: Time in s after which a start of one problem is given up; a hundred times what one takes.
+_TIME_LIMIT = 60.0
+
+#: How often the work goes on after a worker was killed from outside.
+_MOST_RESTARTS = 5
+
+#: Where the workers run; see :func:`generate`.
+ENGINES = ("local", "ray")
+
 #: Problems in a shard; the last shard of a run may have fewer.
 SHARD_SIZE = 100
+
+
+class GenerationError(RuntimeError):
+    """Generation cannot go on; the message says why and what to do. What was made is safe."""
 
 
 @dataclass(frozen=True)
@@ -82,6 +98,7 @@ def generate(
     n_problems: int | None = None,
     workers: int | None = None,
     progress: bool = True,
+    engine: str = "local",
 ) -> GenerationReport:
     """Solves the first ``n_problems`` problems of a recipe and writes them as shards.
 
@@ -92,38 +109,39 @@ def generate(
         out: Folder of the shards; made if need be. One recipe per folder.
         n_problems: How many problems; the recipe's own number if None.
         workers: Processes, each with one thread; one per processor if None.
-        progress: Whether to show a progress bar.
+        progress: Whether to show a progress bar with rate and time left.
+        engine: ``"local"``, processes of this machine, or ``"ray"``, a Ray cluster: the one that
+            the process is connected to, or a local one. All machines need to see ``out``.
 
     Returns:
         What was made, kept and made again.
 
     Raises:
         ValueError: If ``out`` holds shards of another recipe.
-        RuntimeError: If every problem of a shard raised an exception; nothing is written then.
+        GenerationError: If shards cannot be written (a full disk), workers are killed again and
+            again (no memory), or every problem of a shard raised an exception. What was written
+            stays, and the next call goes on from there.
     """
-    import joblib
     from tqdm import tqdm
 
     began = time.perf_counter()
+    if engine not in ENGINES:
+        raise ValueError(f"engine must be one of {ENGINES}, got {engine!r}.")
     n_problems = recipe.n_problems if n_problems is None else n_problems
     if n_problems < 1:
         raise ValueError(f"n_problems must be at least 1, got {n_problems}.")
     folder = Path(out)
     folder.mkdir(parents=True, exist_ok=True)
     _write_recipe(folder, recipe)
+    _remove_leftovers(folder)
     missing, kept, damaged = _missing_shards(folder, recipe, n_problems)
+    done_before = n_problems - sum(count for _, count in missing)
     bar = tqdm(total=n_problems, unit="problem", disable=not progress, smoothing=0.1)
-    bar.update(n_problems - sum(count for _, count in missing))
     n_trajectories, failed = 0, []
-    with bar, joblib.parallel_config(backend="loky", inner_max_num_threads=1):
-        parallel = joblib.Parallel(
-            n_jobs=workers or joblib.cpu_count(), return_as="generator_unordered"
-        )
-        jobs = (
-            joblib.delayed(_make_shard)(folder, recipe, number, count, SHARD_SIZE)
-            for number, count in missing
-        )
-        for count, trajectories, failures in parallel(jobs):
+    with bar:
+        bar.update(done_before)
+        bar.initial = done_before  # the rate is that of this run
+        for count, trajectories, failures in _run(folder, recipe, missing, workers, engine):
             bar.update(count)
             n_trajectories += trajectories
             failed += failures
@@ -137,6 +155,65 @@ def generate(
         failed_problems=tuple(sorted(failed)),
         elapsed=time.perf_counter() - began,
     )
+
+
+def _run(
+    folder: Path,
+    recipe: Recipe,
+    missing: list[tuple[int, int]],
+    workers: int | None,
+    engine: str,
+) -> Iterator[tuple[int, int, list[int]]]:
+    """Makes the missing shards in workers; goes on where some of these are killed."""
+    import joblib
+    from joblib.externals.loky.process_executor import TerminatedWorkerError
+
+    n_jobs = workers or joblib.cpu_count()
+    left = list(missing)
+    for _ in range(1 + _MOST_RESTARTS):
+        jobs = [
+            joblib.delayed(_make_shard)(folder, recipe, number, count, SHARD_SIZE)
+            for number, count in left
+        ]
+        try:
+            if engine == "ray":
+                yield from _run_on_ray(jobs, n_jobs)
+            else:
+                with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+                    yield from joblib.Parallel(n_jobs, return_as="generator_unordered")(jobs)
+            return
+        except TerminatedWorkerError:
+            left = [item for item in left if not shard_path(folder, item[0]).is_file()]
+            logger.warning(
+                "A worker was killed, perhaps for want of memory; going on with %d shards.",
+                len(left),
+            )
+        except OSError as error:
+            reason = "the disk is full" if error.errno == errno.ENOSPC else str(error)
+            raise GenerationError(
+                f"A shard cannot be written in {str(folder)!r}: {reason}. The finished ones are "
+                "safe; make room and start again to go on."
+            ) from error
+    raise GenerationError(
+        f"Workers were killed {1 + _MOST_RESTARTS} times; use fewer (workers={n_jobs // 2 or 1}) "
+        "or find out what kills them (memory?), and start again to go on."
+    )
+
+
+def _run_on_ray(jobs: list[Any], n_jobs: int) -> Iterator[tuple[int, int, list[int]]]:
+    """Through joblib's Ray backend, some shards a worker at a time: it gives results in lists."""
+    import joblib
+
+    try:
+        from ray.util.joblib import register_ray
+    except ImportError as error:
+        raise ModuleNotFoundError(
+            'engine="ray" needs Ray: pip install "freeflyer-gym[cluster]".'
+        ) from error
+    register_ray()
+    with joblib.parallel_config(backend="ray"):
+        for first in range(0, len(jobs), 4 * n_jobs):
+            yield from joblib.Parallel(n_jobs)(jobs[first : first + 4 * n_jobs])
 
 
 def solve_problems(recipe: Recipe, first: int, count: int) -> Shard:
@@ -170,9 +247,10 @@ def solve_problems(recipe: Recipe, first: int, count: int) -> Shard:
 
 def _solve(recipe: Recipe, problem: Problem) -> list[dict[str, Any]]:
     """The records of one problem: REL, then its optima, cheapest first."""
-    from freeflyer_env.planning import solve_multistart
+    from freeflyer_env.planning import SCPConfig, solve_multistart
 
-    found = solve_multistart(problem, n_starts=recipe.n_starts)
+    config = SCPConfig(time_limit=_TIME_LIMIT)
+    found = solve_multistart(problem, n_starts=recipe.n_starts, config=config)
     if found.rel.trajectory is None:
         return []
     records = [_record(problem, found.rel, LABEL_REL, rank=0, start_number=-1)]
@@ -254,7 +332,7 @@ def _make_shard(
     shard = solve_problems(recipe, first, count)
     failed = [first + int(local) for local in np.flatnonzero(shard.failure != "")]
     if all(shard.failure != "") and not all(shard.failure == _UNSOLVED):
-        raise RuntimeError(
+        raise GenerationError(
             f"All {count} problems from {first} on failed, so the shard was not written. "
             f"The first one: {shard.failure[0]}"
         )
@@ -288,6 +366,26 @@ def _missing_shards(
             damaged.append(path.name)
         missing.append((number, count))
     return missing, kept, damaged
+
+
+def _remove_leftovers(folder: Path) -> None:
+    """Removes what killed processes were writing; those of living ones are left alone."""
+    for path in folder.glob("*.tmp"):
+        owner = path.name.split(".")[-2]
+        if not owner.isdigit() or not _is_alive(int(owner)):
+            path.unlink(missing_ok=True)
+
+
+def _is_alive(process: int) -> bool:
+    if os.name == "nt":  # signal 0 is Ctrl-C there
+        return False
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True
 
 
 def _write_recipe(folder: Path, recipe: Recipe) -> None:

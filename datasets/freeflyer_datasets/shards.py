@@ -131,12 +131,15 @@ def write_shard(path: Path, shard: Shard) -> None:
     """Writes a shard so that ``path`` is either absent or complete. Same shard, same bytes."""
     arrays = _arrays(shard)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    with open(temporary, "wb") as file:
-        arrays["digest"] = np.array(_digest(arrays))
-        np.savez(file, allow_pickle=False, **arrays)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)
+    try:
+        with open(temporary, "wb") as file:
+            arrays["digest"] = np.array(_digest(arrays))
+            np.savez(file, allow_pickle=False, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read_shard(path: Path) -> Shard:

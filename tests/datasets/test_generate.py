@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
+import errno
+import importlib
+import os
 import shutil
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from freeflyer_datasets import LABEL_REL, LABEL_SCP, Recipe, generate
-from freeflyer_datasets.generate import solve_problems
+from freeflyer_datasets.generate import GenerationError, solve_problems
 from freeflyer_datasets.shards import ShardError, iterate_shards, list_shards, read_shard
 from freeflyer_env.planning import Trajectory, solve_multistart
+
+GENERATE_MODULE = importlib.import_module("freeflyer_datasets.generate")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -127,10 +134,10 @@ def test_an_exception_is_the_failure_of_its_problem(recipe: Recipe, monkeypatch,
 
     target = recipe.problem(1).start
 
-    def explode(problem, n_starts):
+    def explode(problem, n_starts, config):
         if np.array_equal(problem.start, target):
             raise ZeroDivisionError("as a test")
-        return solve_multistart(problem, n_starts=n_starts)
+        return solve_multistart(problem, n_starts=n_starts, config=config)
 
     monkeypatch.setattr(planning, "solve_multistart", explode)
     shard = solve_problems(recipe, 0, 2)
@@ -144,13 +151,123 @@ def test_an_exception_is_the_failure_of_its_problem(recipe: Recipe, monkeypatch,
 def test_when_everything_fails_nothing_is_written(recipe: Recipe, tmp_path: Path, monkeypatch):
     import freeflyer_env.planning as planning
 
-    def explode(problem, n_starts):
+    def explode(problem, n_starts, config):
         raise ZeroDivisionError("as a test")
 
     monkeypatch.setattr(planning, "solve_multistart", explode)
-    with pytest.raises(RuntimeError, match=r"All 2 problems from 0 on failed.*as a test"):
+    with pytest.raises(GenerationError, match=r"All 2 problems from 0 on failed.*as a test"):
         generate(recipe, tmp_path, n_problems=2, workers=1, progress=False)
     assert not list_shards(tmp_path)
+
+
+GENERATE = """
+import importlib, sys
+from freeflyer_datasets import Recipe
+module = importlib.import_module("freeflyer_datasets.generate")
+module.SHARD_SIZE = 3
+recipe = Recipe("freeflyer/killed-v0", "Killed.", 60, 5, final_times=(30.0,), n_starts=2)
+print("ready", flush=True)
+module.generate(recipe, sys.argv[1], workers=int(sys.argv[2]), progress=False)
+"""
+
+
+def start_generation(folder: Path, workers: int = 1) -> subprocess.Popen:
+    process = subprocess.Popen(
+        [sys.executable, "-c", GENERATE, str(folder), str(workers)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    return process
+
+
+@pytest.mark.slow
+def test_killed_at_ten_random_moments_the_bytes_are_the_same(tmp_path: Path):
+    undisturbed, killed = tmp_path / "undisturbed", tmp_path / "killed"
+    process = start_generation(undisturbed)
+    process.communicate()
+    assert process.returncode == 0
+    rng = np.random.default_rng(0)
+    for number in range(10):
+        process = start_generation(killed, workers=1 + number % 2)
+        time.sleep(rng.uniform(0.0, 0.4))
+        os.killpg(process.pid, signal.SIGKILL)
+        process.communicate()
+    made = len(list_shards(killed))
+    process = start_generation(killed)
+    process.communicate()
+    assert process.returncode == 0
+    assert made < 20, "it was killed too late to matter"
+    assert contents(killed) == contents(undisturbed)
+    assert len(contents(killed)) == 20
+    assert not list(killed.glob("*.tmp"))
+
+
+def test_a_killed_worker_is_reported_and_the_work_goes_on(recipe: Recipe, shards, tmp_path, caplog):
+    killer = Path(tmp_path / "kill-once")
+    killer.touch()
+    report = generate(KillsItsWorker(recipe, killer), tmp_path / "out", workers=2, progress=False)
+    assert "A worker was killed" in caplog.text
+    assert report.n_problems == recipe.n_problems
+    assert contents(tmp_path / "out") == contents(shards)
+
+
+class KillsItsWorker:
+    """A recipe that kills the process in which it is first asked for problem 5."""
+
+    def __init__(self, recipe: Recipe, killer: Path) -> None:
+        self.recipe, self.killer = recipe, killer
+
+    def __getattr__(self, name: str):
+        if name.startswith("__") or name == "recipe":
+            raise AttributeError(name)
+        return getattr(self.recipe, name)
+
+    def problem(self, index: int):
+        if index == 5 and self.killer.is_file():
+            self.killer.unlink()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return self.recipe.problem(index)
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(recipe: Recipe, tmp_path, monkeypatch):
+    write = GENERATE_MODULE.write_shard
+
+    def full(path, shard):
+        if shard.first:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        write(path, shard)
+
+    monkeypatch.setattr(GENERATE_MODULE, "write_shard", full)
+    with pytest.raises(GenerationError, match=r"the disk is full\. The finished ones are safe"):
+        generate(recipe, tmp_path, workers=1, progress=False)
+    assert len(list_shards(tmp_path)) == 1
+    monkeypatch.setattr(GENERATE_MODULE, "write_shard", write)
+    assert generate(recipe, tmp_path, workers=1, progress=False).kept_shards == 1
+
+
+def test_leftovers_of_killed_processes_are_removed(recipe: Recipe, shards, tmp_path):
+    shutil.copytree(shards, tmp_path, dirs_exist_ok=True)
+    gone, alive = tmp_path / "shard-000001.npz.999999999.tmp", tmp_path / f"x.{os.getpid()}.tmp"
+    gone.touch()
+    alive.touch()
+    generate(recipe, tmp_path, workers=1, progress=False)
+    assert not gone.exists()
+    assert alive.exists()
+
+
+def test_a_local_ray_cluster_makes_the_same_bytes(recipe: Recipe, shards, tmp_path):
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    try:
+        generate(recipe, tmp_path, workers=2, progress=False, engine="ray")
+    finally:
+        ray.shutdown()
+    assert contents(tmp_path) == contents(shards)
+    with pytest.raises(ValueError, match="engine must be one of"):
+        generate(recipe, tmp_path, engine="spark")
 
 
 def test_only_the_best_optimum_is_kept_on_request(recipe: Recipe):
