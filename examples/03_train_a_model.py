@@ -1,4 +1,4 @@
-"""Train a small ART from scratch: solve problems, learn from them, warm-start new ones.
+"""Train a small ART from scratch on a sample of a dataset, and warm-start new problems with it.
 
 A real model takes about a hundred thousand problems and an hour; this one shows every step in less
 than a minute.
@@ -15,18 +15,14 @@ import numpy as np
 from art_policy.layers import ARTConfig
 from art_policy.rollout import propose
 from art_policy.train import TrainConfig, train
-from freeflyer_datasets import PackedDataset, Recipe, generate
+from freeflyer_datasets import load_sample
 from freeflyer_env import HELD_OUT_SCENES, sample_problem
 from freeflyer_env.planning import solve_rel, solve_scp
 
 
 def main() -> None:
-    recipe = Recipe(
-        id="freeflyer/example-v0", description="Random problems.", n_problems=100, seed=0
-    )
+    dataset = load_sample("scene-random-v0")
     with tempfile.TemporaryDirectory() as folder:
-        generate(recipe, Path(folder, "shards"), workers=1)
-        dataset = PackedDataset.from_shards(Path(folder, "shards"))
         print(f"{dataset.n_problems} problems, {len(dataset)} trajectories")
         config = TrainConfig(max_steps=100, batch_size=64, learning_rate=2e-3, ema_decay=0.98)
         out = Path(folder, "model")

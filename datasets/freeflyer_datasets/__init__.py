@@ -14,7 +14,7 @@ from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 
 if TYPE_CHECKING:
     from freeflyer_datasets.export import build
-    from freeflyer_datasets.loading import PackedDataset
+    from freeflyer_datasets.loading import PackedDataset, list_samples, load_sample
 
 __all__ = [
     "LABEL_REL",
@@ -25,15 +25,17 @@ __all__ = [
     "build",
     "generate",
     "list_recipes",
+    "list_samples",
     "load_recipe",
+    "load_sample",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name == "PackedDataset":
-        from freeflyer_datasets.loading import PackedDataset
+    if name in ("PackedDataset", "list_samples", "load_sample"):
+        from freeflyer_datasets import loading
 
-        return PackedDataset
+        return getattr(loading, name)
     if name == "build":
         from freeflyer_datasets.export import build
 

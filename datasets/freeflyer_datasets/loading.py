@@ -7,6 +7,7 @@ shards, and made again when its source has changed.
 
 from __future__ import annotations
 
+import difflib
 import json
 import logging
 import os
@@ -28,7 +29,8 @@ from freeflyer_datasets.packing import (
     describe_file,
     write_pack,
 )
-from freeflyer_datasets.shards import iterate_shards, source_digest
+from freeflyer_datasets.recipe import packaged_folder
+from freeflyer_datasets.shards import iterate_shards, read_shard, source_digest
 from freeflyer_env import dynamics
 from freeflyer_env.robot import FloatArray, Robot
 from freeflyer_env.scenario import Obstacles, Problem, Scenario
@@ -218,6 +220,37 @@ class PackedDataset:
         threshold = max(validation_fraction, float(np.nextafter(score.min(), 1.0)))
         held_out = (score < threshold)[self.problem_index]
         return np.flatnonzero(~held_out), np.flatnonzero(held_out)
+
+
+def list_samples() -> list[str]:
+    """Names of the samples that come with the package, such as ``"scene-random-v0"``."""
+    return sorted(path.stem for path in packaged_folder("samples").glob("*.npz"))
+
+
+def load_sample(name: str) -> PackedDataset:
+    """The first 200 problems of a dataset, with all their trajectories; nothing is downloaded.
+
+    Args:
+        name: Of the dataset, ``"scene-random-v0"`` or ``"freeflyer/scene-random-v0"``.
+
+    Returns:
+        The packed form, kept in a hidden folder of Minari's data root.
+
+    Raises:
+        ValueError: If there is no such sample; the message names the nearest one.
+    """
+    from freeflyer_datasets.storage import dataset_folder
+
+    short, names = name.removeprefix("freeflyer/"), list_samples()
+    if short not in names:
+        near = difflib.get_close_matches(short, names, n=1)
+        hint = f" Did you mean {near[0]!r}?" if near else ""
+        raise ValueError(f"No sample is called {name!r}.{hint} There are: {', '.join(names)}.")
+    shard = read_shard(packaged_folder("samples") / f"{short}.npz")
+    cache = dataset_folder(f".samples/{short}")
+    return _cached(
+        cache, f"freeflyer/{short}", shard.digest(), lambda: iter([chunk_of_shard(shard)])
+    )
 
 
 def _cached(

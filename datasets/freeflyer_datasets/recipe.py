@@ -172,14 +172,14 @@ def load_recipe(name_or_path: str | Path) -> Recipe:
 
 def list_recipes() -> list[str]:
     """Names of the packaged recipes, such as ``"scene-random-v0"``."""
-    return sorted(path.stem for path in _recipes_folder().glob("*.toml"))
+    return sorted(path.stem for path in packaged_folder("recipes").glob("*.toml"))
 
 
-def _recipes_folder() -> Path:
-    """In an installed package beside this file, in a checkout one folder higher."""
+def packaged_folder(name: str) -> Path:
+    """A folder of data: in an installed package beside this file, in a checkout one level up."""
     here = Path(__file__).resolve().parent
-    packaged = here / "recipes"
-    return packaged if packaged.is_dir() else here.parent / "recipes"
+    packaged = here / name
+    return packaged if packaged.is_dir() else here.parent / name
 
 
 def _recipe_path(name_or_path: str | Path) -> Path:
@@ -197,7 +197,7 @@ def _recipe_path(name_or_path: str | Path) -> Path:
             hint = f" Did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"No recipe is called {name!r}.{hint} Known: {', '.join(names)}.")
         name = max(versions, key=lambda known: int(known.rsplit("-v", 1)[1]))
-    return _recipes_folder() / f"{name}.toml"
+    return packaged_folder("recipes") / f"{name}.toml"
 
 
 def _require_int(name: str, value: object, low: int, high: int) -> int:

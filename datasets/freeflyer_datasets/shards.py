@@ -10,7 +10,7 @@ import hashlib
 import os
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -127,14 +127,33 @@ def list_shards(folder: Path) -> list[Path]:
     return sorted(folder.glob("shard-*.npz"))
 
 
-def write_shard(path: Path, shard: Shard) -> None:
+def join_shards(shards: Iterable[Shard]) -> Shard:
+    """One shard of the problems of consecutive shards."""
+    parts = list(shards)
+    offsets = np.cumsum([0, *(len(part.controls) for part in parts)])
+    firsts = np.cumsum([0, *(part.n_problems for part in parts)])
+    values: dict[str, Any] = {}
+    for item in fields(Shard):
+        if item.name not in ("fingerprint", "first", "offsets", "problem"):
+            values[item.name] = np.concatenate([getattr(part, item.name) for part in parts])
+    values["problem"] = np.concatenate(
+        [part.problem + first for part, first in zip(parts, firsts)]
+    ).astype(np.int32)
+    values["offsets"] = np.concatenate(
+        [np.zeros(1, dtype=np.int64)] + [part.offsets[1:] + by for part, by in zip(parts, offsets)]
+    )
+    return Shard(parts[0].fingerprint, parts[0].first, **values)
+
+
+def write_shard(path: Path, shard: Shard, *, compressed: bool = False) -> None:
     """Writes a shard so that ``path`` is either absent or complete. Same shard, same bytes."""
+    save = np.savez_compressed if compressed else np.savez
     arrays = _arrays(shard)
     temporary = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as file:
             arrays["digest"] = np.array(_digest(arrays))
-            np.savez(file, allow_pickle=False, **arrays)
+            save(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)

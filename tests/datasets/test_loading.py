@@ -10,7 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from freeflyer_datasets import LABEL_SCP, PackedDataset, Recipe
+from freeflyer_datasets import (
+    LABEL_SCP,
+    PackedDataset,
+    Recipe,
+    list_recipes,
+    list_samples,
+    load_recipe,
+    load_sample,
+)
+from freeflyer_datasets.generate import solve_problems
 from freeflyer_datasets.shards import iterate_shards, list_shards
 
 
@@ -113,3 +122,25 @@ def test_open_refuses_what_is_damaged(packed: PackedDataset, tmp_path: Path):
         PackedDataset.open(packed.path, verify=True)
     with pytest.raises(ValueError, match="not a packed dataset"):
         PackedDataset.open(tmp_path)
+
+
+@pytest.mark.parametrize("name", list_samples())
+def test_samples_are_the_first_problems_of_their_recipes(name):
+    sample, recipe = load_sample(name), load_recipe(name)
+    assert sample.dataset_id == recipe.id
+    assert sample.n_problems == 200
+    for index in (0, 57, 199):
+        assert sample.problem(index).to_dict() == recipe.problem(index).to_dict()
+    shard = solve_problems(recipe, 0, 1)
+    first = np.flatnonzero(sample.problem_index == 0)
+    np.testing.assert_allclose(sample.cost[first], shard.cost, rtol=1e-5)
+    for row in np.flatnonzero(sample.label == LABEL_SCP)[:40:8]:
+        problem = sample.problem(int(sample.problem_index[row]))
+        assert sample.trajectory(row).check(problem).satisfied(2e-6)
+
+
+def test_every_recipe_has_a_sample_and_a_wrong_name_is_one_line():
+    assert list_samples() == list_recipes()
+    assert len(load_sample("freeflyer/time-4-v0")) == len(load_sample("time-4-v0"))
+    with pytest.raises(ValueError, match="Did you mean 'time-4-v0'"):
+        load_sample("time4-v0")
