@@ -1,7 +1,7 @@
 """The ``freeflyer`` command line.
 
-Bad input ends with one line on standard error and exit code 2; ``--json`` prints one JSON object
-for machines on standard output.
+Bad input ends with one line on standard error and exit code 2, planning that finds no solution with
+exit code 1; ``--json`` prints one JSON object for machines on standard output.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from art_policy.cli_io import (
     problem_of,
     write_plan,
 )
+from freeflyer_datasets.generate import ENGINES, GenerationError
 
 DEFAULT_MODEL = "art-scene-random"
 
@@ -37,21 +38,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.given = set(arguments if arguments is not None else sys.argv[1:])
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
-        options.run(options)
+        return options.run(options) or 0
     except KeyboardInterrupt:
         print("interrupted; generate and train resume with the same command", file=sys.stderr)
         return 130
-    except (ValueError, OSError, ModuleNotFoundError) as error:
+    except (ValueError, OSError, ModuleNotFoundError, GenerationError) as error:
         message = " ".join(str(error).split())
         print(f"freeflyer {options.command}: error: {message}", file=sys.stderr)
         return 2
-    return 0
 
 
 # -- commands ------------------------------------------------------------------------------------
 
 
-def _plan(options: argparse.Namespace) -> None:
+def _plan(options: argparse.Namespace) -> int:
     check_out(options.out, (".json", ".png"))
     problem = problem_of(options)
     plan = planner_of(options).plan(problem)
@@ -60,6 +60,7 @@ def _plan(options: argparse.Namespace) -> None:
         write_plan(options.out, problem, plan)
         summary["out"] = str(options.out)
     print_result(options, summary, plan_text(plan))
+    return 0 if plan.result.solved else 1
 
 
 def _fly(options: argparse.Namespace) -> None:
@@ -90,6 +91,7 @@ def _generate(options: argparse.Namespace) -> None:
         recipe,
         n_problems=options.problems,
         workers=options.workers,
+        engine=options.engine,
         progress=not options.json,
         force=options.force,
     )
@@ -238,7 +240,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, run: Callable[[argparse.Namespace], None], text: str) -> Any:
+    def command(name: str, run: Callable[[argparse.Namespace], int | None], text: str) -> Any:
         sub = commands.add_parser(name, help=text, description=text)
         sub.set_defaults(run=run)
         sub.add_argument("--seed", type=int, default=0, help="seed of everything random")
@@ -265,6 +267,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("recipe", help="a recipe's name or TOML file")
     sub.add_argument("--problems", type=count, help="how many problems (default: the recipe's)")
     sub.add_argument("--workers", type=count, help="processes (default: one per processor)")
+    sub.add_argument("--engine", choices=ENGINES, default="local", help="ray: a Ray cluster")
     sub.add_argument("--out", help="Minari data root (default: Minari's own)")
     sub.add_argument("--force", action="store_true", help="replace a dataset of the same id")
 

@@ -30,7 +30,7 @@ def test_plan_writes_a_plan_that_can_be_read_again(capsys, tmp_path, untrained_m
 
 def test_plan_takes_start_goal_scene_and_final_time(capsys, untrained_model):
     result = run(
-        capsys, "plan", "--scene", "held-out-2", "--final-time", "50", "--model", "rel",
+        capsys, "plan", "--scene", "held-out-3", "--final-time", "50", "--model", "rel",
         "--start", "0.2", "1.2", "0", "--goal", "3.3", "1.0", "6.5",
     )  # fmt: skip
     assert result["problem"]["start"][:3] == [0.2, 1.2, 0.0]

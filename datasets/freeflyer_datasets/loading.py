@@ -205,6 +205,37 @@ class PackedDataset:
         controls = self.controls_of(rows).astype(np.float64)
         return dynamics.rollout(start, controls, self.dt, self.robot)
 
+    def windows(
+        self, indices: ArrayLike, first: ArrayLike, length: int
+    ) -> tuple[FloatArray, NDArray[np.float32], NDArray[np.bool_]]:
+        """Sub-sequences of trajectories, of any lengths.
+
+        Args:
+            indices: ``(B,)`` trajectories.
+            first: ``(B,)`` first step of each window.
+            length: Number ``K`` of steps.
+
+        Returns:
+            States ``(B, K, 6)`` before each step, controls ``(B, K, 3)``, and ``(B, K)`` whether
+            the step exists. Beyond a trajectory's end the controls are zero and the state stays.
+        """
+        rows = np.asarray(indices, dtype=np.int64).reshape(-1)
+        begin = np.asarray(first, dtype=np.int64).reshape(-1)
+        n_steps = self.offsets[rows + 1] - self.offsets[rows]
+        if (begin < 0).any() or (begin >= n_steps).any() or length < 1:
+            raise ValueError("Windows must begin within their trajectories and have a length.")
+        step = np.arange(int(n_steps.max(initial=0)))
+        before = step < n_steps[:, None]
+        position = np.where(before, self.offsets[rows][:, None] + step, 0)
+        whole = np.where(before[..., None], self.controls[position], np.float32(0.0))
+        start = np.asarray(self.start[self.problem_index[rows]])
+        states = dynamics.rollout(start, whole, self.dt, self.robot)
+        ahead = begin[:, None] + np.arange(length)
+        inside, row = ahead < n_steps[:, None], np.arange(len(rows))[:, None]
+        controls = whole[row, np.minimum(ahead, len(step) - 1)]
+        controls[~inside] = 0.0
+        return states[row, np.minimum(ahead, n_steps[:, None])], controls, inside
+
     def split(self, validation_fraction: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
         """Indices of the training and of the validation trajectories.
 

@@ -70,14 +70,16 @@ def push_out(
     positions = np.array(positions, dtype=np.float64)
     low, high = scenario.position_limits
     for _ in range(rounds):
-        before = positions
+        before = positions.copy()
         for centre, radius in zip(scenario.obstacles.centres, scenario.keep_out_radii):
-            offset = positions - centre
-            distance = np.linalg.norm(offset, axis=-1, keepdims=True)
-            pushed = centre + offset * ((radius + margin) / np.maximum(distance, 1e-9))
-            positions = np.where(distance < radius + margin, pushed, positions)
-        positions = np.clip(positions, low, high)
-        if np.allclose(before, positions, rtol=0.0, atol=1e-9):
+            x, y = positions[..., 0] - centre[0], positions[..., 1] - centre[1]
+            distance = np.sqrt(x * x + y * y)
+            inside = distance < radius + margin
+            stretch = (radius + margin) / np.maximum(distance[inside], 1e-9)
+            positions[inside, 0] = centre[0] + x[inside] * stretch
+            positions[inside, 1] = centre[1] + y[inside] * stretch
+        np.clip(positions, low, high, out=positions)
+        if np.abs(before - positions).max(initial=0.0) <= 1e-9:
             break
     return positions
 

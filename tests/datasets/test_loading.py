@@ -144,3 +144,23 @@ def test_every_recipe_has_a_sample_and_a_wrong_name_is_one_line():
     assert len(load_sample("freeflyer/time-4-v0")) == len(load_sample("time-4-v0"))
     with pytest.raises(ValueError, match="Did you mean 'time-4-v0'"):
         load_sample("time4-v0")
+
+
+def test_windows_are_parts_of_the_trajectories():
+    sample = load_sample("time-4-v0")
+    rows, first = np.array([0, 7, 300, 831]), np.array([0, 15, 60, 70])
+    states, controls, inside = sample.windows(rows, first, 40)
+    assert states.shape == (4, 40, 6)
+    for number, (row, begin) in enumerate(zip(rows, first)):
+        trajectory = sample.trajectory(row)
+        n = min(40, trajectory.n_steps - begin)
+        assert inside[number].sum() == n
+        np.testing.assert_allclose(
+            states[number, :n], trajectory.states[begin : begin + n], atol=1e-12
+        )
+        np.testing.assert_array_equal(
+            controls[number, :n], sample.controls_of([row])[0][begin : begin + n]
+        )
+        assert not controls[number, n:].any()
+    with pytest.raises(ValueError, match="begin within"):
+        sample.windows([0], [400], 5)
