@@ -236,6 +236,38 @@ class PackedDataset:
         controls[~inside] = 0.0
         return states[row, np.minimum(ahead, n_steps[:, None])], controls, inside
 
+    def transitions(self, indices: ArrayLike | None = None) -> dict[str, NDArray[np.float32]]:
+        """Trajectories as flat arrays, one row a step, as offline-RL libraries such as d3rlpy read them.
+
+        Args:
+            indices: ``(B,)`` trajectories; all if None.
+
+        Returns:
+            ``observations`` ``(sum N, D)``, the environment's observation flattened as
+            ``gymnasium.spaces.flatten`` does it (goal, obstacles, state, time to go); ``actions``
+            ``(sum N, 3)``; ``rewards`` and ``terminals`` ``(sum N,)``. For d3rlpy:
+            ``d3rlpy.dataset.MDPDataset(**data.transitions())``.
+        """
+        rows = np.arange(len(self)) if indices is None else np.asarray(indices, dtype=np.int64)
+        observations, actions, terminals = [], [], []
+        for row in rows.reshape(-1):
+            problem = self.problem_index[row]
+            states = self.states([row])[0, :-1]
+            n_steps = len(states)
+            to_go = self.final_time[problem] - self.dt * np.arange(n_steps)[:, None]
+            fixed = np.concatenate([self.goal[problem], self.obstacles[problem].ravel()])
+            fixed = np.broadcast_to(fixed, (n_steps, len(fixed)))
+            observations.append(np.hstack([fixed, states, to_go]).astype(np.float32))
+            actions.append(self.controls_of([row])[0])
+            terminals.append((np.arange(n_steps) == n_steps - 1).astype(np.float32))
+        flat = np.concatenate(actions) if actions else np.empty((0, 3), np.float32)
+        return {
+            "observations": np.concatenate(observations),
+            "actions": flat,
+            "rewards": -np.abs(flat).sum(axis=1),
+            "terminals": np.concatenate(terminals),
+        }
+
     def split(self, validation_fraction: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
         """Indices of the training and of the validation trajectories.
 

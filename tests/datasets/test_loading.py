@@ -7,6 +7,7 @@ import pickle
 import shutil
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -164,3 +165,29 @@ def test_windows_are_parts_of_the_trajectories():
         assert not controls[number, n:].any()
     with pytest.raises(ValueError, match="begin within"):
         sample.windows([0], [400], 5)
+
+
+def test_transitions_are_the_flattened_episodes():
+    sample = load_sample("scene-random-v0")
+    flat = sample.transitions([3, 4, 9])
+    env = gym.make("freeflyer_env:FreeFlyer-v0")
+    problem = sample.problem(int(sample.problem_index[3]))
+    observation, _ = env.reset(options={"problem": problem})
+    expected = gym.spaces.flatten(env.observation_space, observation)
+    np.testing.assert_allclose(flat["observations"][0], expected, rtol=1e-6)
+    assert {name: len(value) for name, value in flat.items()} == dict.fromkeys(flat, 240)
+    assert np.flatnonzero(flat["terminals"]).tolist() == [79, 159, 239]
+    assert flat["rewards"][:80].sum() == pytest.approx(-sample.cost[3], rel=1e-5)
+
+
+def test_d3rlpy_clones_the_behaviour():
+    d3rlpy = pytest.importorskip("d3rlpy")
+    sample = load_sample("scene-random-v0")
+    dataset = d3rlpy.dataset.MDPDataset(**sample.transitions(range(40)))
+    algorithm = d3rlpy.algos.BCConfig(batch_size=64).create(device=False)
+    history = algorithm.fit(
+        dataset, n_steps=50, n_steps_per_epoch=50, show_progress=False, save_interval=100,
+        logger_adapter=d3rlpy.logging.NoopAdapterFactory(),
+    )  # fmt: skip
+    assert len(history) == 1
+    assert algorithm.predict(sample.transitions([0])["observations"]).shape == (80, 3)
