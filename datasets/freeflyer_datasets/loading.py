@@ -237,7 +237,7 @@ class PackedDataset:
         return states[row, np.minimum(ahead, n_steps[:, None])], controls, inside
 
     def transitions(self, indices: ArrayLike | None = None) -> dict[str, NDArray[np.float32]]:
-        """Trajectories as flat arrays, one row a step, as offline-RL libraries such as d3rlpy read them.
+        """Trajectories as flat arrays, one row a step, for offline-RL libraries such as d3rlpy.
 
         Args:
             indices: ``(B,)`` trajectories; all if None.

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 from typing import Any
@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 
 from freeflyer_datasets.shards import LABEL_SCP, Shard
 from freeflyer_env import dynamics
-from freeflyer_env.constraints import FEASIBILITY_TOLERANCE
-from freeflyer_env.scenario import Scenario
+from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, keep_out_depth
+from freeflyer_env.scenario import Obstacles, Scenario
 
 #: Attributes of every episode besides Minari's own ``id`` and ``total_steps``.
 EPISODE_ATTRIBUTES = {
@@ -124,7 +124,7 @@ def _repeated(value: NDArray[np.float64], count: int) -> NDArray[np.float32]:
 def check_episode(
     episode: Episode, observation_space: gym.spaces.Dict, action_space: gym.spaces.Box
 ) -> None:
-    """Checks what Minari does not: lengths, types, spaces, dynamics, goal and return.
+    """Checks what Minari does not: lengths, types, spaces, dynamics, goal, return and constraints.
 
     Raises:
         EpisodeError: If something is wrong.
@@ -158,6 +158,12 @@ def check_episode(
     require(miss <= FEASIBILITY_TOLERANCE, f"the last state is {miss:.1e} from the goal")
     gap = abs(float(episode.rewards.sum()) + episode.attributes["cost"])
     require(gap <= 1e-9, f"the return differs from minus the cost by {gap:.1e}")
+    obstacles = Obstacles.from_rows(episode.observations["obstacles"][0])
+    depth = keep_out_depth(replace(scenario, obstacles=obstacles), exact[:-1, :2])
+    # Float32 may move a node that touches a disc to its other side.
+    least, most = (int((depth > margin).sum()) for margin in (2 * FEASIBILITY_TOLERANCE, 0.0))
+    expected = 0 if episode.attributes["label"] == LABEL_SCP else episode.attributes["c_rel"]
+    require(least <= expected <= most, f"{least} to {most} nodes violate keep-out, not {expected}")
 
 
 def _check_array(require: Any, name: str, value: NDArray[Any], rows: int, space: Any) -> None:

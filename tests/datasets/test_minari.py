@@ -183,6 +183,7 @@ BAD_EPISODES = [
     (lambda e: {"rewards": e.rewards * 1.01}, "return differs from minus the cost"),
     (lambda e: {"rewards": e.rewards[1:]}, "rewards has shape"),
     (lambda e: {"truncations": ~e.truncations}, "must end at its last step only"),
+    (lambda e: {"attributes": {**e.attributes, "c_rel": 60}}, "nodes violate keep-out, not 60"),
 ]
 
 
