@@ -200,6 +200,23 @@ def _render(options: argparse.Namespace) -> None:
     print_result(options, {"out": options.out}, f"wrote {options.out}")
 
 
+def _upload(options: argparse.Namespace) -> None:
+    from freeflyer_datasets.sharing import upload
+
+    url = upload(options.dataset, remote=options.remote, progress=not options.json)
+    print_result(options, {"dataset": options.dataset, "url": url}, f"published at {url}")
+
+
+def _download(options: argparse.Namespace) -> None:
+    from freeflyer_datasets.sharing import download
+
+    folder = download(
+        options.dataset, remote=options.remote, force=options.force, progress=not options.json
+    )
+    text = f"fetched into {folder}; load it with minari.load_dataset({options.dataset!r})"
+    print_result(options, {"dataset": options.dataset, "folder": str(folder)}, text)
+
+
 def _info(options: argparse.Namespace) -> None:
     from art_policy.model import ART, shipped_models
 
@@ -294,6 +311,16 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("dataset", help="Minari id")
     sub.add_argument("--episode", type=int, default=0)
     sub.add_argument("--out", required=True, help=".gif or .png")
+
+    for name, share, text in (
+        ("upload", _upload, "Publish a local dataset on the Hugging Face hub; resumes."),
+        ("download", _download, "Fetch a dataset from the Hugging Face hub; resumes."),
+    ):
+        sub = command(name, share, text)
+        sub.add_argument("dataset", help="Minari id")
+        sub.add_argument("--remote", help="hf://OWNER (default: Minari's own setting)")
+        if name == "download":
+            sub.add_argument("--force", action="store_true", help="replace a local dataset")
 
     sub = command("info", _info, "What is installed, or a model's description.")
     sub.add_argument("name", nargs="?", help="a model")

@@ -1,7 +1,7 @@
 """Datasets: generation a core, the share of solver time in it, storage, loading, windows.
 
-``python -m benchmarks.datasets`` makes everything in a temporary folder; ``--shards FOLDER`` packs and
-opens shards that are there instead, to see large sizes.
+``python -m benchmarks.datasets`` makes everything in a temporary folder; with ``--shards FOLDER``
+shards that are there are packed and opened, to see large sizes.
 """
 
 from __future__ import annotations

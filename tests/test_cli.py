@@ -137,3 +137,13 @@ def test_wrong_options_exit_with_2(value):
     with pytest.raises(SystemExit) as stop:
         main(["plan", "--candidates", value])
     assert stop.value.code == 2
+
+
+def test_sharing_commands_are_one_line_where_they_cannot(capsys, monkeypatch, tmp_path):
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    assert main(["upload", "freeflyer/absent-v0", "--remote", "hf://nobody"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("freeflyer upload: error:")
+    assert error.count("\n") == 1
+    assert main(["download", "no id", "--remote", "hf://nobody"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
