@@ -57,6 +57,7 @@ def build(
     n_problems: int | None = None,
     shards: str | Path | None = None,
     workers: int | None = None,
+    engine: str = "local",
     progress: bool = True,
     force: bool = False,
     credits: Credits | None = None,
@@ -70,6 +71,7 @@ def build(
         n_problems: How many problems; the recipe's own number if None.
         shards: Folder of the shards; a hidden folder in Minari's data root if None.
         workers: Processes; one per processor if None.
+        engine: ``"local"`` or ``"ray"``; see :func:`generate`.
         progress: Whether to show progress bars.
         force: Whether to replace a dataset of the same id.
         credits: Who publishes it.
@@ -83,7 +85,7 @@ def build(
     recipe = recipe if isinstance(recipe, Recipe) else load_recipe(recipe)
     _refuse_existing(recipe.id, force)
     folder = Path(shards) if shards is not None else dataset_folder(f".shards/{recipe.id}")
-    report = generate(recipe, folder, n_problems, workers, progress)
+    report = generate(recipe, folder, n_problems, workers, progress, engine)
     logger.info("%s", report)
     return export(
         folder,
