@@ -18,7 +18,10 @@ def main() -> None:
     problem = sample_problem(np.random.default_rng(3), Scenario.named("held-out-1"))
     front = pareto_front(problem)
     for final_time, cost, bound in zip(front.final_times, front.costs, front.rel_costs):
-        print(f"{final_time:6.1f} s: {cost:.4f} m/s (without obstacles {bound:.4f})")
+        if np.isfinite(cost):
+            print(f"{final_time:6.1f} s: {cost:.4f} m/s (without obstacles {bound:.4f})")
+        else:
+            print(f"{final_time:6.1f} s: no solution")
     final_time, _ = front.best(price_of_time=0.002)
     print(f"if a second is worth 2 mm/s of delta-V, take {final_time:g} s")
     front.plot().figure.savefig(options.out, dpi=110)
