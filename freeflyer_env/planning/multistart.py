@@ -42,8 +42,8 @@ def solve_multistart(
 
     Args:
         problem: What to solve.
-        n_starts: Number of starts, at least 1; 1 is SCP from REL. Fewer are used where the
-            obstacles allow fewer classes.
+        n_starts: Number of starts, at least 1; 1 is SCP from REL (where that failed, from the
+            straight line). Fewer are used where the obstacles allow fewer classes.
         config: Settings of every SCP loop; ``reroutes`` plays no part, the starts are the routes.
         n_jobs: Processes over which the starts are spread; worth it where one problem has to be
             solved fast. For many problems use :func:`solve_many`.
@@ -54,10 +54,10 @@ def solve_multistart(
     if n_starts < 1:
         raise ValueError(f"n_starts must be at least 1, got {n_starts}.")
     rel = solve_rel(problem, config)
-    if rel.trajectory is None or problem.defects():
+    if rel.status.hopeless or problem.defects():
         return MultistartResult(rel, (solve_scp(problem, straight_line(problem), config),), ())
     config = replace(config or SCPConfig(), reroutes=0)
-    starts = [rel.trajectory]
+    starts = [rel.trajectory or straight_line(problem)]
     if n_starts > 1:
         starts += homotopy_starts(problem, n_starts - 1)
     if n_jobs == 1 or len(starts) == 1:
