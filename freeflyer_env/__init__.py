@@ -21,7 +21,11 @@ from freeflyer_env.scenario import (
 __version__ = "0.1.0"
 
 if "FreeFlyer-v0" not in registry:
-    register(id="FreeFlyer-v0", entry_point="freeflyer_env.env:FreeFlyerEnv")
+    register(
+        id="FreeFlyer-v0",
+        entry_point="freeflyer_env.env:FreeFlyerEnv",
+        vector_entry_point="freeflyer_env.vector_env:FreeFlyerVectorEnv",
+    )
 
 __all__ = [
     "HELD_OUT_SCENES",

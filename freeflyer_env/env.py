@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
+import copy
 import math
-from collections.abc import Mapping
+import operator
+from collections import deque
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,25 +16,44 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from freeflyer_env.control import PulseWidthModulator
+from freeflyer_env.disturbances import Disturbances, Plant
 from freeflyer_env.physics import World
-from freeflyer_env.robot import FloatArray, Robot, body_from_world
+from freeflyer_env.robot import FloatArray, Robot
 from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_problem
+from freeflyer_env.sensors import lidar_angles, top_view
 from freeflyer_env.spaces import (
     ACTION_MODES,
+    LIDAR_REACH,
+    MAX_OBSTACLE_SPEED,
+    MODALITIES,
     action_space,
     observation_space,
     obstacle_rows,
+    require_choice,
     require_fit,
 )
 
 #: One period of the pulse-width modulation in s (10 Hz), the control step of the thruster modes.
 PWM_PERIOD = 0.1
 
+#: Names of the rewards; see :class:`FreeFlyerEnv`.
+REWARDS = ("paper", "dense")
+
+#: Weights of the errors in position, heading, speed and rate in the dense reward, in 1/m, 1/rad ...
+ERROR_WEIGHTS = (1.0, 0.2, 2.0, 0.2)
+
 # Impulses this much over the thrusters' reach still pass: plans are exact to a solver's tolerance
 # only, and have to be replayed exactly.
 _REACH_TOLERANCE = 1e-3
 
 _MAX_OBSTACLES = 4
+
+# What an episode changes.
+_EPISODE = (
+    *("problem", "_world", "_modulator", "_pending", "_plan", "_duties", "_flown", "_ended"),
+    *("_step_count", "_n_steps", "_cost", "_firing_time", "_goal", "_aim", "_rows", "_measured"),
+    *("_potential", "_np_random", "_np_random_seed"),
+)
 
 
 class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
@@ -48,6 +69,9 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     Generation via Multimodal Learning with Transformers": mass 16 kg, inertia 0.18 kg m^2, radius
     0.15 m, thrust 0.2 N, table 3.5 m x 2.5 m. Contacts are real (pymunk); drift is exact. The
     thrusters are drawn in :mod:`freeflyer_env.robot`.
+
+    The global frame has its origin in the table's lower left corner, x to the right, y up; headings
+    and rates are positive counter-clockwise. The state is that of the hull's centre.
 
     ## Action Space
 
@@ -67,23 +91,40 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
 
     `action_mode="on_off"`: `MultiBinary(8)`, each thruster on or off for the next 0.1 s.
 
+    | Num | Thruster pushes (body frame) | Turns | Num | Thruster pushes | Turns |
+    |-----|------------------------------|-------|-----|-----------------|-------|
+    | 0   | -y                           | -     | 4   | +y              | -     |
+    | 1   | -x                           | +     | 5   | +x              | +     |
+    | 2   | +x                           | -     | 6   | -x              | -     |
+    | 3   | -y                           | +     | 7   | +y              | +     |
+
     ## Observation Space
 
-    `Dict`, all float32, SI units, global frame:
+    `Dict`, float32 but for the image, SI units, global frame:
 
-    | Key          | Shape  | What                                                               |
-    |--------------|--------|--------------------------------------------------------------------|
-    | `state`      | (6,)   | `(r_x, r_y, psi, v_x, v_y, omega)`; the heading is not wrapped     |
-    | `goal`       | (6,)   | the same of the goal                                               |
-    | `obstacles`  | (M, 3) | `(x, y, radius)` of each disc; rows of zeros where there are fewer |
-    | `time_to_go` | (1,)   | time left in s                                                     |
+    | Key          | Modalities       | Shape     | What                                         |
+    |--------------|------------------|-----------|----------------------------------------------|
+    | `state`      | `state`, `robot` | (6,)      | `(r_x, r_y, psi, v_x, v_y, omega)`, measured |
+    | `goal`       | `state`, `robot` | (6,)      | the same of the goal                         |
+    | `time_to_go` | `state`, `robot` | (1,)      | time left in s                               |
+    | `obstacles`  | `state`          | (M, 3)    | `(x, y, radius)` of each disc; zeros: none   |
+    | `image`      | `image`          | (H, W, 3) | uint8, the table seen from above             |
+    | `lidar`      | `lidar`          | (n,)      | distance in m from the robot's centre to     |
+    |              |                  |           | what is there, anticlockwise from ahead      |
+
+    Headings are not wrapped. Where obstacles move, their rows go on with `(v_x, v_y)`.
+    `freeflyer_env.spaces.obstacle_mask` tells obstacles from padding.
 
     ## Rewards
 
-    `delta_v`: `-||u||_1` of the realised impulse, the negative of the paper's cost. Thruster modes:
-    minus the thrust impulse per unit mass of all eight thrusters in m/s, the propellant; this is
-    `||u||_1` for a push along a body axis, differs from it for other directions and turns, and
-    counts thrusters that work against each other. On success `success_reward` is added.
+    `reward="paper"` (default). `delta_v`: `-||u||_1` of the realised impulse, the negative of the
+    paper's cost. Thruster modes: minus the thrust impulse per unit mass of all eight thrusters in
+    m/s, the propellant; this is `||u||_1` for a push along a body axis, differs from it for other
+    directions and turns, and counts thrusters that work against each other. On success
+    `success_reward` is added.
+
+    `reward="dense"` adds by how much the weighted error to the goal fell, 1 per m, 0.2 per rad, 2
+    per m/s and 0.2 per rad/s (potential-based shaping: it does not change which policy is best).
 
     ## Starting State
 
@@ -94,91 +135,155 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     ## Episode End
 
     Terminated on success: within `goal_tolerance` of the goal in position, heading (whole turns do
-    not matter), speed and rate; at the final time only, if `terminate_early=False`. Truncated at
-    the final time, or when the centre leaves the table, which only `contacts=False` makes possible.
+    not matter), speed and rate; at the final time only, if `terminate_early=False`. Terminated on
+    the first contact, if `terminate_on_contact=True`. Truncated at the final time, or when the
+    centre leaves the table, which only `contacts=False` makes possible.
 
     ## Info
 
     `is_success`, `goal_error` (position m, heading rad, speed m/s, rate rad/s), `cost` so far,
-    `firing_time` of each thruster so far in s (for `delta_v` what the impulses would take),
-    `contacts` of the last step (`count`, `impulse` in N s, `with`: obstacle indices and `"wall"`).
+    `fuel` so far (thrust impulse of all thrusters in N s), `firing_time` of each thruster so far in
+    s (for `delta_v` what the impulses would take), `contacts` of the last step (`count`, `impulse`
+    in N s, `with`: obstacle indices and `"wall"`). All of it is true, whatever is measured.
 
     ## Arguments
 
     * `action_mode`: see above.
+    * `observation`: a modality or several: `"state"`, `"robot"` (without the obstacles), `"image"`,
+      `"lidar"`; for example `("robot", "lidar")`.
     * `scenario`: `"random"` (new obstacles at every reset), the name of one of the paper's scenes
-      (`freeflyer_env.SCENES`), rows `(x, y, radius)`, or a `Scenario`; all but the last can be
-      stored in an environment's spec.
+      (`freeflyer_env.SCENES`), rows `(x, y, radius)` or `(x, y, radius, v_x, v_y)`, or a
+      `Scenario`; all but the last can be stored in an environment's spec.
+    * `n_obstacles`: of random scenes, a number or the range `(least, most)`; default 4.
+    * `obstacle_speed`: largest speed in m/s of the obstacles of random scenes.
     * `final_time`: in s.
+    * `reward`: `"paper"` or `"dense"`.
     * `success_reward`: added to the reward on success.
     * `terminate_early`: whether success ends the episode before the final time.
+    * `terminate_on_contact`: whether a contact ends it.
     * `goal_tolerance`: `(position m, heading rad, speed m/s, rate rad/s)`.
     * `sub_steps`: physics steps in a control step. In `delta_v` free flight does not depend on
       them; under thrust that turns with the robot the error is of second order in their length,
       and pulses are whole numbers of them. Contacts are found at their ends, after an overlap of
       up to one sub-step's motion (50 ms in `delta_v`).
     * `max_obstacles`: rows of the `obstacles` observation; default: the scene's, at least 4.
+    * `moving_obstacles`: whether rows of `obstacles` have velocities; default: if any can move.
     * `restitution`, `friction`: of all contacts.
     * `contacts`: `False` lets the robot pass through obstacles and walls, as in the optimal control
       problem's model; relaxed trajectories replay exactly then.
-    * `render_mode`: `"rgb_array"`. Ten frames a second are real time in the thruster modes, and
-      five times as fast in `delta_v`.
+    * `disturbances`: `"testbed"`, a mapping or a `freeflyer_env.disturbances.Disturbances`: noise
+      of the measurements, a tilted table, thrusters, mass and centre of mass that are not as
+      assumed, delay. None by default.
+    * `image_size`: `(H, W)` in pixels; `lidar_rays`: number of rays.
+    * `render_mode`: `"rgb_array"` or `"human"` (a window). Ten frames a second are real time in the
+      thruster modes, and five times as fast in `delta_v`.
+
+    `save()` and `restore()` take an episode back to where it was, bit for bit; `copy.deepcopy` and
+    pickle work at any moment. The vector form, `gym.make_vec("FreeFlyer-v0", num_envs=1024,
+    vectorization_mode="vector_entry_point")`, is one NumPy batch.
 
     ## Version History
 
     * v0: initial version
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 10}  # noqa: RUF012
 
     def __init__(
         self,
         action_mode: str = "delta_v",
+        observation: str | Sequence[str] = "state",
         scenario: str | Scenario | list[list[float]] = "random",
+        n_obstacles: int | tuple[int, int] | None = None,
+        obstacle_speed: float = 0.0,
         final_time: float = 40.0,
+        reward: str = "paper",
         success_reward: float = 1.0,
         terminate_early: bool = True,
+        terminate_on_contact: bool = False,
         goal_tolerance: tuple[float, float, float, float] = (0.05, 0.1, 0.02, 0.05),
         sub_steps: int = 10,
         max_obstacles: int | None = None,
+        moving_obstacles: bool | None = None,
         restitution: float = 0.5,
         friction: float = 0.0,
         contacts: bool = True,
+        disturbances: Disturbances | str | Mapping[str, Any] | None = None,
+        image_size: tuple[int, int] = (80, 112),
+        lidar_rays: int = 32,
         render_mode: str | None = None,
     ) -> None:
-        _require_choice("action_mode", action_mode, ACTION_MODES)
+        require_choice("action_mode", action_mode, ACTION_MODES)
+        require_choice("reward", reward, REWARDS)
+        self.modalities = (observation,) if isinstance(observation, str) else tuple(observation)
+        for modality in self.modalities or ("none",):
+            require_choice("observation", modality, MODALITIES)
         if render_mode not in (None, *self.metadata["render_modes"]):
-            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}.")
-        if sub_steps < 1:
-            raise ValueError(f"sub_steps must be at least 1, got {sub_steps}.")
+            raise ValueError(
+                f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}."
+            )
+        for name, value in (("sub_steps", sub_steps), ("lidar_rays", lidar_rays)):
+            if value < 1:
+                raise ValueError(f"{name} must be at least 1, got {value}.")
+        if len(image_size) != 2 or min(image_size) < 8:
+            raise ValueError(
+                f"image_size must be (height, width) of at least 8 pixels, got {image_size}."
+            )
         if len(goal_tolerance) != 4 or not all(value > 0.0 for value in goal_tolerance):
             raise ValueError(f"goal_tolerance must be four positive numbers, got {goal_tolerance}.")
+        if not 0.0 <= obstacle_speed <= MAX_OBSTACLE_SPEED:
+            raise ValueError(
+                f"obstacle_speed must be in [0, {MAX_OBSTACLE_SPEED:g}] m/s, got {obstacle_speed}."
+            )
         self.action_mode, self.render_mode, self.sub_steps = action_mode, render_mode, sub_steps
-        self.final_time, self.success_reward = float(final_time), float(success_reward)
-        self.terminate_early, self.goal_tolerance = terminate_early, tuple(goal_tolerance)
+        self.final_time, self.reward = float(final_time), reward
+        self.success_reward, self.goal_tolerance = float(success_reward), tuple(goal_tolerance)
+        self.terminate_early, self.terminate_on_contact = terminate_early, terminate_on_contact
         self.restitution, self.friction, self.contacts = restitution, friction, contacts
-        self._fixed_scenario = _scenario(scenario)
+        self.disturbances = Disturbances.of(disturbances)
+        if n_obstacles is None:
+            n_obstacles = (
+                _MAX_OBSTACLES if max_obstacles is None else min(max_obstacles, _MAX_OBSTACLES)
+            )
+        self.obstacle_speed, self.n_obstacles = float(obstacle_speed), obstacle_count(n_obstacles)
+        self._fixed_scenario = fixed_scenario(scenario)
         self._base = base = self._fixed_scenario or Scenario()
-        n_obstacles = len(base.obstacles) if self._fixed_scenario else _MAX_OBSTACLES
-        self.max_obstacles = max(n_obstacles, _MAX_OBSTACLES)
-        if max_obstacles is not None:
-            if max_obstacles < n_obstacles and self._fixed_scenario:
-                raise ValueError(
-                    f"max_obstacles must be at least the scene's {n_obstacles}, "
-                    f"got {max_obstacles}."
-                )
-            self.max_obstacles = max_obstacles
+        most = len(base.obstacles) if self._fixed_scenario else self.n_obstacles[1]
+        self.max_obstacles = max(most, _MAX_OBSTACLES) if max_obstacles is None else max_obstacles
+        if self.max_obstacles < most:
+            raise ValueError(
+                f"max_obstacles must be at least the scene's {most}, got {max_obstacles}."
+            )
+        if moving_obstacles is None:
+            moving_obstacles = bool(
+                base.obstacles.moving if self._fixed_scenario else self.obstacle_speed
+            )
+        self.moving_obstacles = moving_obstacles
         self.control_dt = base.dt if action_mode == "delta_v" else PWM_PERIOD
         self.action_space = action_space(action_mode, base.robot, base.dt)
-        self.observation_space: spaces.Dict = observation_space(base, self.max_obstacles)
-        self._modulator = PulseWidthModulator(sub_steps)
+        self._action_shape: Any = self.action_space.shape
+        sizes: dict[str, Any] = {
+            "moving": moving_obstacles,
+            "image_size": image_size,
+            "lidar_rays": lidar_rays,
+        }
+        self.observation_space: spaces.Dict = observation_space(
+            base, self.max_obstacles, self.modalities, **sizes
+        )
+        self._limits = observation_space(base, self.max_obstacles, **sizes)
+        low, high = (getattr(self._limits["state"], name).tolist() for name in ("low", "high"))
+        self._state_limits = list(zip(low, high))
+        self._keys, self._thrust = tuple(self.observation_space), base.robot.thrust
+        self._rays, self._image_size = lidar_angles(lidar_rays), image_size
+        self._modulator = self._make_modulator()
         self._plan: FloatArray | None = None
         self._world: World | None = None
+        self._window: Any = None
         self._step_count = 0
         # A problem to show before the first reset, and an early error for arguments that are wrong.
         self.problem = self._sample_problem(np.random.default_rng(0))
-        require_fit(self.problem, base, self.observation_space)
-        self._make_world()
+        require_fit(self.problem, base, self._limits)
+        self._make_world(None)
 
     @property
     def scenario(self) -> Scenario:
@@ -187,13 +292,19 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
 
     @property
     def robot(self) -> Robot:
-        """The robot."""
+        """The robot, as it is assumed to be."""
         return self.problem.scenario.robot
 
     @property
     def state(self) -> FloatArray:
         """True state ``(6,)``, float64, a fresh array."""
         return self._require_world().state
+
+    @property
+    def measured_state(self) -> FloatArray:
+        """State ``(6,)`` as last measured, float64, a fresh array; true without noise."""
+        self._require_world()
+        return np.array(self._measured)
 
     @property
     def time(self) -> float:
@@ -206,7 +317,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         """Starts an episode.
 
         Args:
-            seed: Seeds the random problems.
+            seed: Seeds the random problems and disturbances.
             options: ``{"problem": ...}`` sets the problem: a ``Problem``, or a mapping as
                 ``Problem.to_dict`` gives it (an observation from the start of an episode will do).
 
@@ -218,20 +329,32 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         if unknown := sorted(set(options) - {"problem"}):
             raise ValueError(f"reset() knows only the option 'problem', got {unknown}.")
         self.problem = self._make_problem(options.get("problem"))
-        self._constants = {
-            "goal": np.float32(self.problem.goal),
-            "obstacles": obstacle_rows(self.problem, self.max_obstacles),
-        }
-        self._world = self._make_world()
+        self._goal = np.float32(self.problem.goal)
+        self._aim = self.problem.goal.tolist()
+        self._rows = obstacle_rows(
+            self.problem.scenario.obstacles, self.max_obstacles, self.moving_obstacles
+        )
+        plant = None
+        if self.disturbances.any_plant:
+            plant = self.disturbances.sample(self.robot, self.np_random)
+        self._world = self._make_world(plant)
         self._world.state = self.problem.start
         self._modulator.reset()
-        self._plan, self._duties = None, np.zeros(8)
-        self._step_count, self._cost, self._firing_time = 0, 0.0, np.zeros(8)
+        self._pending: deque[Any] = deque(
+            np.zeros(self._action_shape) for _ in range(self.disturbances.delay)
+        )
+        self._plan, self._duties = None, [0.0] * 8
+        self._step_count, self._cost, self._firing_time = 0, 0.0, [0.0] * 8
         self._ended = False
         self._n_steps = math.ceil(self.problem.final_time / self.control_dt - 1e-6)
-        self._flown = [self.problem.start[:2]]
-        state = self._world.state
-        return self._observation(state), self._info(state)
+        self._flown = [tuple(self.problem.start[:2].tolist())]
+        state = self._world.state_values()
+        error = self._goal_error(state)
+        self._potential = _potential(error)
+        observation, info = self._observation(state), self._info(error)
+        if self.render_mode == "human":
+            self.render()
+        return observation, info
 
     def step(
         self, action: NDArray[Any]
@@ -239,35 +362,49 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         """Applies an action for one control step."""
         world = self._require_world()
         action = np.asarray(action)
-        if action.shape != self.action_space.shape or not np.isfinite(action).all():
+        if action.shape != self._action_shape or not all(map(math.isfinite, action.tolist())):
             raise ValueError(
-                f"An action of mode {self.action_mode!r} must be {self.action_space.shape} finite "
+                f"An action of mode {self.action_mode!r} must be {self._action_shape} finite "
                 f"numbers, got {action.tolist()}."
             )
         if self._ended:
             gym.logger.warn("step() was called after the episode's end; call reset() first.")
-        effort = self._act(world, action.astype(np.float64))
+        if self._pending:
+            self._pending.append(action)
+            action = self._pending.popleft()
+        effort = self._act(world, action)
         self._cost += effort
         self._step_count += 1
-        state = world.state
-        self._flown.append(state[:2])
-        info = self._info(state)
+        state = world.state_values()
+        self._flown.append((state[0], state[1]))
+        error = self._goal_error(state)
+        info = self._info(error)
         at_end = self._step_count >= self._n_steps
-        terminated = bool(info["is_success"] and (at_end or self.terminate_early))
+        success = bool(info["is_success"] and (at_end or self.terminate_early))
+        crashed = self.terminate_on_contact and info["contacts"]["count"] > 0
+        terminated = success or crashed
         truncated = not terminated and (at_end or self._off_table(state))
-        reward = -effort + (self.success_reward if terminated and not self._ended else 0.0)
+        reward = -effort + (self.success_reward if success and not self._ended else 0.0)
+        if self.reward == "dense":
+            before, self._potential = self._potential, _potential(error)
+            reward += self._potential - before
         self._ended = self._ended or terminated or truncated
-        return self._observation(state), reward, terminated, truncated, info
+        observation = self._observation(state)
+        if self.render_mode == "human":
+            self.render()
+        return observation, reward, terminated, truncated, info
 
     def render(self) -> NDArray[np.uint8] | None:
-        """The scene as ``(H, W, 3)`` uint8, with planned and flown path."""
+        """The scene as ``(H, W, 3)`` uint8, with planned and flown path; or in a window."""
         if self.render_mode is None:
             gym.logger.warn("render() needs render_mode: gym.make(..., render_mode='rgb_array').")
             return None
-        from freeflyer_env.rendering import draw_scene
+        from freeflyer_env.rendering import Window, draw_scene
 
-        return draw_scene(
-            self.scenario,
+        picture = draw_scene(
+            replace(self.scenario, obstacles=self.scenario.obstacles.after(self.time))
+            if self.scenario.obstacles.moving
+            else self.scenario,
             self.state[:3],
             start=self.problem.start[:3],
             goal=self.problem.goal[:3],
@@ -276,6 +413,36 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             flown=np.array(self._flown),
             time=self.time,
         )
+        if self.render_mode == "rgb_array":
+            return picture
+        if self._window is None:
+            self._window = Window("FreeFlyer", self.metadata["render_fps"])
+        self._window.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None
+
+    def save(self) -> dict[str, Any]:
+        """A snapshot of the episode, for :meth:`restore`; independent of what follows."""
+        self._require_world()
+        return copy.deepcopy({name: getattr(self, name) for name in _EPISODE})
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Goes back to a snapshot of this environment, or of one that was made alike.
+
+        From there the same actions lead to the same bits, random numbers included.
+        """
+        if set(snapshot) != set(_EPISODE):
+            raise ValueError("restore() takes what save() gave.")
+        for name, value in copy.deepcopy(snapshot).items():
+            setattr(self, name, value)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_window": None}
 
     def set_plan(self, states: FloatArray | None) -> None:
         """Shows the positions of the states ``(N, 6)`` as planned path; forgotten at reset."""
@@ -286,30 +453,48 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         change = np.asarray(velocity_change, dtype=np.float64)
         if change.shape != (3,) or not np.isfinite(change).all():
             raise ValueError(f"A push is three finite numbers, got {velocity_change}.")
-        self._require_world().kick(change)
+        self._require_world().kick(tuple(change.tolist()))
 
-    def _act(self, world: World, action: FloatArray) -> float:
+    def _act(self, world: World, action: NDArray[Any]) -> float:
         """Applies the action, advances the world, returns the effort in m/s."""
-        robot, period = self.robot, self.control_dt
         if self.action_mode == "delta_v":
-            body = body_from_world(world.state[2], action)
-            excess = float(robot.reach(body, period))
-            if excess > 1.0 + _REACH_TOLERANCE:
-                action, body = action / excess, body / excess
-            self._duties = robot.allocate(body * robot.mass / period)
-            self._firing_time += self._duties * period
-            world.kick(action * robot.control_gain)
-            world.advance(period, self.sub_steps)
-            return float(np.abs(action).sum())
+            return self._act_impulse(world, action.tolist())
+        period, robot = self.control_dt, self.robot
         if self.action_mode == "thrusters":
-            pulses = self._modulator.pulses(action)
+            pulses = self._modulator.pulses(action.astype(np.float64))
         else:
             pulses = np.broadcast_to(action > 0.5, (self.sub_steps, 8))
-        wrenches = pulses @ robot.wrench_matrix.T
-        world.advance(period, self.sub_steps, wrenches)
-        self._duties = pulses.mean(axis=0)
-        self._firing_time += self._duties * period
-        return float(robot.thrust / robot.mass * self._duties.sum() * period)
+        forces = pulses * world.plant.thrust_scale
+        world.advance(period, self.sub_steps, forces @ robot.wrench_matrix.T)
+        self._fire((pulses.sum(axis=0) / self.sub_steps).tolist())
+        return robot.thrust / robot.mass * period * sum(self._duties)
+
+    def _act_impulse(self, world: World, action: list[float]) -> float:
+        robot, period, psi = self.robot, self.control_dt, world.heading
+        ux, uy, turn = action
+        cos, sin = math.cos(psi), math.sin(psi)
+        body = (cos * ux + sin * uy, cos * uy - sin * ux, turn)
+        excess = robot.reach_of_one(*body, period)
+        if excess > 1.0 + _REACH_TOLERANCE:
+            ux, uy, turn = ux / excess, uy / excess, turn / excess
+            body = (body[0] / excess, body[1] / excess, turn)
+        force = robot.mass / period
+        self._fire(robot.allocate_one(body[0] * force, body[1] * force, turn * force))
+        if self.disturbances.any_plant:
+            forces = np.array(self._duties) * world.plant.thrust_scale
+            world.impulse(robot.wrench_matrix @ forces * period)
+        else:
+            world.kick((ux, uy, turn * robot.mass_over_inertia))
+        world.advance(period, self.sub_steps)
+        return abs(ux) + abs(uy) + abs(turn)
+
+    def _fire(self, duties: list[float]) -> None:
+        """Notes the duties of the last period; a thruster that has failed does not fire."""
+        if self.disturbances.failed_thruster is not None:
+            duties[self.disturbances.failed_thruster] = 0.0
+        self._duties = duties
+        dt = self.control_dt
+        self._firing_time = [time + duty * dt for time, duty in zip(self._firing_time, duties)]
 
     def _make_problem(self, given: Any) -> Problem:
         if given is None:
@@ -319,45 +504,100 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
                 f"A problem must be a Problem or a mapping, got {type(given).__name__}."
             )
         problem = given if isinstance(given, Problem) else Problem.from_dict(given, self._base)
-        require_fit(problem.require_valid(), self._base, self.observation_space)
+        require_fit(problem.require_valid(), self._base, self._limits)
         return problem
 
     def _sample_problem(self, rng: np.random.Generator) -> Problem:
-        n_obstacles = min(self.max_obstacles, _MAX_OBSTACLES)
-        return sample_problem(rng, self._fixed_scenario, self.final_time, n_obstacles=n_obstacles)
+        least, most = self.n_obstacles
+        count = least
+        if self._fixed_scenario is None and most > least:
+            count = int(rng.integers(least, most + 1))
+        return sample_problem(
+            rng, self._fixed_scenario, self.final_time, count, self.obstacle_speed
+        )
 
-    def _observation(self, state: FloatArray) -> dict[str, Any]:
-        box: Any = self.observation_space["state"]
-        time_to_go = max(self.problem.final_time - self.time, 0.0)
-        return {
-            "state": np.minimum(np.maximum(np.float32(state), box.low), box.high),
-            **{key: value.copy() for key, value in self._constants.items()},
-            "time_to_go": np.array([time_to_go], dtype=np.float32),
-        }
+    def _observation(self, state: list[float]) -> dict[str, Any]:
+        noise, values = self.disturbances, state
+        if noise.any_noise:
+            values = noise.measure(np.array(state), self.np_random).tolist()
+        self._measured = values
+        observation: dict[str, Any] = {}
+        for key in self._keys:
+            if key == "state":
+                for value, (low, high) in zip(values, self._state_limits):
+                    if not low <= value <= high:
+                        bounds = np.array(self._state_limits).T
+                        values = np.clip(values, *bounds).tolist()
+                        break
+                observation[key] = np.array(values, dtype=np.float32)
+            elif key == "goal":
+                observation[key] = self._goal.copy()
+            elif key == "obstacles":
+                observation[key] = self._present_rows().copy()
+            elif key == "time_to_go":
+                left = self.problem.final_time - self._step_count * self.control_dt
+                observation[key] = np.array([left if left > 0.0 else 0.0], dtype=np.float32)
+            elif key == "image":
+                observation[key] = top_view(
+                    state[:3],
+                    self.problem.goal[:3],
+                    self._present_rows(),
+                    self._image_size,
+                    self._base.table,
+                    self.robot.radius,
+                )
+            else:
+                ranges = self._require_world().ranges(self._rays, LIDAR_REACH)
+                if noise.range_noise > 0.0:
+                    ranges += noise.range_noise * self.np_random.standard_normal(len(ranges))
+                observation[key] = np.clip(ranges, 0.0, LIDAR_REACH).astype(np.float32)
+        return observation
 
-    def _off_table(self, state: FloatArray) -> bool:
+    def _present_rows(self) -> NDArray[np.float32]:
+        """Rows of the obstacles as they are now, within the observation's bounds."""
+        obstacles = self.problem.scenario.obstacles
+        if not obstacles.moving:
+            return self._rows
+        rows = obstacle_rows(obstacles, self.max_obstacles, True, self.time)
+        box: Any = self._limits["obstacles"]
+        return np.clip(rows, box.low, box.high)
+
+    def _off_table(self, state: list[float]) -> bool:
         """Whether the centre has left the table, as it can where there are no contacts."""
-        (x, y), (width, height) = state[:2].tolist(), self._base.table
-        return not self.contacts and not (0.0 <= x <= width and 0.0 <= y <= height)
+        if self.contacts:
+            return False
+        x, y, (width, height) = state[0], state[1], self._base.table
+        return not (0.0 <= x <= width and 0.0 <= y <= height)
 
-    def _info(self, state: FloatArray) -> dict[str, Any]:
-        x, y, psi, v_x, v_y, omega = (state - self.problem.goal).tolist()
-        error = (
+    def _goal_error(self, state: list[float]) -> tuple[float, float, float, float]:
+        x, y, psi, v_x, v_y, omega = map(operator.sub, state, self._aim)
+        return (
             math.hypot(x, y),
             abs((psi + math.pi) % (2.0 * math.pi) - math.pi),
             math.hypot(v_x, v_y),
             abs(omega),
         )
+
+    def _info(self, error: tuple[float, float, float, float]) -> dict[str, Any]:
+        position, heading, speed, rate = self.goal_tolerance
         return {
-            "is_success": all(e <= t for e, t in zip(error, self.goal_tolerance)),
+            "is_success": error[0] <= position
+            and error[1] <= heading
+            and error[2] <= speed
+            and error[3] <= rate,
             "goal_error": error,
             "cost": self._cost,
-            "firing_time": self._firing_time.copy(),
+            "fuel": self._thrust * sum(self._firing_time),
+            "firing_time": np.array(self._firing_time),
             "contacts": self._require_world().take_contacts().to_info(),
         }
 
-    def _make_world(self) -> World:
-        return World(self.scenario, self.restitution, self.friction, solid=self.contacts)
+    def _make_modulator(self) -> PulseWidthModulator:
+        shortest = self.disturbances.min_on_time * self.sub_steps / PWM_PERIOD
+        return PulseWidthModulator(self.sub_steps, math.ceil(shortest - 1e-9))
+
+    def _make_world(self, plant: Plant | None) -> World:
+        return World(self.scenario, self.restitution, self.friction, self.contacts, plant)
 
     def _require_world(self) -> World:
         if self._world is None:
@@ -365,7 +605,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         return self._world
 
 
-def _scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
+def fixed_scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
+    """The scenario that an environment's argument names; None for random ones."""
     if isinstance(given, Scenario):
         return given
     if not isinstance(given, str):
@@ -373,8 +614,15 @@ def _scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
     return None if given == "random" else Scenario.named(given)
 
 
-def _require_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        near = difflib.get_close_matches(str(value), choices, n=1)
-        hint = f" Did you mean {near[0]!r}?" if near else ""
-        raise ValueError(f"{name} must be one of {choices}, got {value!r}.{hint}")
+def obstacle_count(given: int | tuple[int, int]) -> tuple[int, int]:
+    """The range ``(least, most)`` that the argument ``n_obstacles`` means."""
+    least, most = (given, given) if isinstance(given, int | np.integer) else given
+    if not 0 <= least <= most:
+        raise ValueError(
+            f"n_obstacles must be a number >= 0 or a range (least, most), got {given!r}."
+        )
+    return int(least), int(most)
+
+
+def _potential(error: tuple[float, float, float, float]) -> float:
+    return -sum(map(operator.mul, ERROR_WEIGHTS, error))

@@ -1,9 +1,13 @@
-"""The pymunk world: walls, disc obstacles, the robot, contacts.
+"""The world: free flight in closed form, contacts with discs and walls in pymunk.
 
-Chipmunk advances positions with the velocities before it advances velocities with the forces. Half
-of a sub-step's velocity change is therefore applied before and half after it (velocity Verlet),
-which makes the motion under a constant world force exact at any number of sub-steps. A thruster's
-force turns with the body; over a sub-step it is applied at the heading of the sub-step's middle.
+As long as nothing can be touched, the motion is that of a rigid body under known forces: drift is
+exact, and so is a constant world force, by half a kick before and half after each sub-step
+(velocity Verlet). A thruster's force turns with the body; over a sub-step it is applied at the
+heading of the sub-step's middle. Where a contact is possible, pymunk takes the steps, with the same
+half kicks, because Chipmunk advances positions before velocities.
+
+Moving obstacles are kinematic bodies: at the end of every sub-step they are where
+:meth:`Obstacles.centres_at` says, whatever they touch.
 """
 
 from __future__ import annotations
@@ -15,11 +19,14 @@ from typing import Any
 import numpy as np
 import pymunk
 
+from freeflyer_env.disturbances import Plant
 from freeflyer_env.robot import FloatArray
-from freeflyer_env.scenario import Scenario
+from freeflyer_env.scenario import Obstacles, Scenario
 
 _WALL_THICKNESS = 0.5  # m: thick enough that nothing tunnels through
 _ROBOT, _WALL, _FIRST_OBSTACLE = 1, 2, 3
+_SCENE_CATEGORY, _ROBOT_CATEGORY = 0b01, 0b10
+_MARGIN = 1e-6  # m between hull and surroundings below which pymunk takes over
 
 
 @dataclass
@@ -42,6 +49,9 @@ class ContactLog:
         return {"count": self.count, "impulse": self.impulse, "with": touched}
 
 
+_NO_CONTACTS = ContactLog()
+
+
 class World:
     """One robot on one table.
 
@@ -49,7 +59,8 @@ class World:
         scenario: Table, obstacles and robot; the physical discs collide, not their keep-out radii.
         restitution: Of every contact, 0 (plastic) to 1 (elastic).
         friction: Coulomb coefficient of every contact.
-        solid: Whether there are obstacles and walls to touch.
+        solid: Whether the robot touches obstacles and walls; otherwise it passes through.
+        plant: The true robot, thrusters and tilt of the table; default: the nominal ones.
     """
 
     def __init__(
@@ -58,57 +69,85 @@ class World:
         restitution: float = 0.5,
         friction: float = 0.0,
         solid: bool = True,
+        plant: Plant | None = None,
     ) -> None:
         for name, value in (("restitution", restitution), ("friction", friction)):
             if not 0.0 <= value <= 1.0:
                 raise ValueError(f"{name} must be in [0, 1], got {value}.")
         self.scenario = scenario
-        self._solid = solid
-        # Calls that lead here from a moment at which the state was all there is to know.
+        self.plant = plant or Plant.nominal(scenario.robot)
+        self.contacts = ContactLog()
+        self._settings = (scenario, restitution, friction, solid, self.plant)
+        self._solid, self._balanced = solid, not any(self.plant.com)
+        self._time = 0.0
+        # Pose and velocities of the centre of mass: the truth while nothing can be touched.
+        self._free = [0.0] * 6
+        # So far (m) the hull may move before it could touch something; at least.
+        self._room = 0.0
+        self._obstacle_speed = _top_speed(scenario.obstacles)
+        # While pymunk has the truth: the calls since it took over, of which the first places all.
+        self._engaged = False
         self._history: list[tuple[str, tuple[Any, ...]]] = []
         self._steps_apart, self._touched = 0, False
-        # Chipmunk multiplies the two shapes' values; the robot's are one.
         self._surface = (restitution, friction)
-        self.contacts = ContactLog()
-        self._space = pymunk.Space()
-        self._space.gravity = (0.0, 0.0)
-        # Chipmunk's defaults think in pixels, here distances are in metres: hardly any overlap is
-        # tolerated, and the rest of it is gone after one step.
-        self._space.collision_slop = 1e-4
-        self._space.collision_bias = 0.0
-        # The default tree reports pairs in an order that depends on where the robot has been.
-        self._space.use_spatial_hash(1.0, 100)
-        robot = scenario.robot
-        self._body = pymunk.Body(robot.mass, robot.inertia)
-        self._shape = pymunk.Circle(self._body, robot.radius)
-        self._shape.elasticity, self._shape.friction = 1.0, 1.0
-        self._shape.collision_type = _ROBOT
-        self._space.add(self._body, self._shape)
-        if solid:
-            self._add_obstacles()
-            self._add_walls()
+        self._space: pymunk.Space | None = None
+        self._movers: list[pymunk.Body] = []
 
     def __reduce__(self) -> tuple[Any, ...]:
         # Chipmunk keeps contact impulses and push-out velocities that it neither shows nor takes
         # back, so a copy made during a contact has to go through that contact again.
-        settings = (self.scenario, *self._surface, self._solid)
-        return _replayed, (settings, self._history, self.contacts)
+        history = self._history if self._engaged else [("_fly", self._flight())]
+        return _replayed, (self._settings, history, self.contacts)
 
     @property
     def state(self) -> FloatArray:
-        """State ``(6,)`` of the robot, a fresh array."""
-        body = self._body
-        return np.array([*body.position, body.angle, *body.velocity, body.angular_velocity])
+        """State ``(6,)`` of the hull's centre, a fresh array."""
+        return np.array(self.state_values())
 
     @state.setter
     def state(self, value: FloatArray) -> None:
-        self._place([float(item) for item in value])
+        x, y, psi, vx, vy, rate = (float(item) for item in value)
+        if not self._balanced:
+            lx, ly = self._lever(psi)
+            x, y, vx, vy = x + lx, y + ly, vx - rate * ly, vy + rate * lx
+        self._fly([x, y, psi, vx, vy, rate], self._time, 0.0)
 
-    def kick(self, velocity_change: FloatArray) -> None:
-        """Changes ``(v_x, v_y, omega)`` at once, as an impulse does."""
-        change = tuple(float(item) for item in velocity_change)
-        self._history.append(("kick", (change,)))
-        self._kick(*change)
+    def state_values(self) -> list[float]:
+        """:attr:`state` as six plain floats."""
+        if self._balanced:
+            return list(self._centre_of_mass())
+        x, y, psi, vx, vy, rate = self._centre_of_mass()
+        lx, ly = self._lever(psi)
+        return [x - lx, y - ly, psi, vx + rate * ly, vy - rate * lx, rate]
+
+    @property
+    def heading(self) -> float:
+        """Heading in rad."""
+        return self._centre_of_mass()[2]
+
+    @property
+    def time(self) -> float:
+        """Time in s, which says where moving obstacles are."""
+        return self._time
+
+    def kick(self, velocity_change: tuple[float, float, float]) -> None:
+        """Changes ``(v_x, v_y, omega)`` of the hull's centre at once, as an impulse does."""
+        vx, vy, turn = velocity_change
+        if not self._balanced:
+            lx, ly = self._lever(self.heading)
+            vx, vy = vx - turn * ly, vy + turn * lx
+        self._kick(vx, vy, turn)
+
+    def impulse(self, impulse_body: FloatArray) -> None:
+        """Gives the impulse ``(J_x, J_y, L)`` in N s, N s, N m s at the hull's centre, body frame.
+
+        The robot's true mass, inertia and centre of mass decide what comes of it.
+        """
+        jx, jy, angular = (float(item) for item in impulse_body)
+        robot, (x, y), angle = self.plant.robot, self.plant.com, self.heading
+        cos, sin = math.cos(angle) / robot.mass, math.sin(angle) / robot.mass
+        turn = (angular - (x * jy - y * jx)) / robot.inertia
+        self._kick(cos * jx - sin * jy, sin * jx + cos * jy, turn)
 
     def advance(
         self, duration: float, sub_steps: int, wrenches_body: FloatArray | None = None
@@ -118,80 +157,261 @@ class World:
         Args:
             duration: In s.
             sub_steps: Number of equal physics steps.
-            wrenches_body: ``(sub_steps, 3)`` wrench ``(F_x, F_y, M)`` in N, N, N m, body frame,
-                of each sub-step; None lets the robot drift.
+            wrenches_body: ``(sub_steps, 3)`` wrench ``(F_x, F_y, M)`` in N, N, N m about the hull's
+                centre, body frame, of each sub-step; None lets the robot drift.
         """
+        h = duration / sub_steps
         wrenches = None if wrenches_body is None else wrenches_body.tolist()
-        self._advance(duration / sub_steps, sub_steps, wrenches)
+        if wrenches is None and any(self.plant.acceleration):
+            wrenches = [[0.0, 0.0, 0.0]] * sub_steps
+        if self._engaged:
+            self._advance(h, sub_steps, wrenches)
+        elif wrenches is None:
+            if self._has_room(duration):
+                self._drift(duration)
+            else:
+                self._engage()
+                self._advance(h, sub_steps, None)
+        else:
+            for index, wrench in enumerate(wrenches):
+                half = self._half_kick(h, wrench)
+                self._kick(*half)
+                if not self._has_room(h):
+                    self._kick(-half[0], -half[1], -half[2])
+                    self._engage()
+                    self._advance(h, sub_steps - index, wrenches[index:])
+                    break
+                self._drift(h)
+                self._kick(*half)
+
+    def ranges(self, angles: FloatArray, reach: float) -> FloatArray:
+        """Distances ``(n,)`` in m from the hull's centre to what lies in the directions.
+
+        Args:
+            angles: ``(n,)`` in rad from the robot's heading.
+            reach: Largest distance in m, given where nothing is nearer.
+        """
+        space = self._require_space()
+        if not self._engaged:
+            self._place_movers()
+        x, y, psi = self.state_values()[:3]
+        seen = pymunk.ShapeFilter(mask=_SCENE_CATEGORY)
+        distances = np.full(len(angles), float(reach))
+        for index, angle in enumerate((np.asarray(angles) + psi).tolist()):
+            end = (x + reach * math.cos(angle), y + reach * math.sin(angle))
+            hit = space.segment_query_first((x, y), end, 0.0, seen)
+            if hit is not None:
+                distances[index] = hit.alpha * reach
+        return distances
 
     def take_contacts(self) -> ContactLog:
         """The contacts since the last call."""
-        log, self.contacts = self.contacts, ContactLog()
-        return log
+        log = self.contacts
+        if log.count or log.impulse:
+            self.contacts = ContactLog()
+            return log
+        return _NO_CONTACTS
 
-    def _place(self, x: list[float]) -> None:
-        self._history.append(("_place", (x,)))
-        self._body.position, self._body.angle = (x[0], x[1]), x[2]
-        self._body.velocity, self._body.angular_velocity = (x[3], x[4]), x[5]
-        self._space.reindex_shapes_for_body(self._body)
+    # -- free flight -----------------------------------------------------------------------------
 
-    def _advance(self, h: float, sub_steps: int, wrenches: list[list[float]] | None) -> None:
-        self._history.append(("_advance", (h, sub_steps, wrenches)))
-        self._steps_apart += sub_steps
-        self._touched = False
-        if wrenches is None:
-            for _ in range(sub_steps):
-                self._space.step(h)
-        else:
-            self._push(h, wrenches)
-        if self._touched:
-            self._steps_apart = 0
-        elif self._steps_apart > self._space.collision_persistence:
-            self._history = [("_place", (self.state.tolist(),))]
+    def _flight(self) -> tuple[list[float], float, float]:
+        return list(self._free), self._time, self._room
 
-    def _push(self, h: float, wrenches: list[list[float]]) -> None:
-        """Steps of ``h`` seconds, one under each body wrench."""
-        body, robot = self._body, self.scenario.robot
-        for fx, fy, torque in wrenches:
-            alpha = torque / robot.inertia
-            middle = body.angle + 0.5 * h * (body.angular_velocity + 0.25 * h * alpha)
-            cos, sin, gain = math.cos(middle), math.sin(middle), 0.5 * h / robot.mass
-            half = gain * (cos * fx - sin * fy), gain * (sin * fx + cos * fy), 0.5 * h * alpha
-            self._kick(*half)
-            self._space.step(h)
-            self._kick(*half)
+    def _fly(self, centre_of_mass: list[float], time: float, room: float) -> None:
+        """Sets everything there is to know in free flight."""
+        self._engaged = False
+        self._free, self._time, self._room = list(centre_of_mass), time, room
+
+    def _has_room(self, duration: float) -> bool:
+        """Whether nothing can be touched for so long at the present velocity."""
+        if not self._solid:
+            return True
+        _, _, _, vx, vy, rate = self._free
+        way = duration * (math.hypot(vx, vy) + self._obstacle_speed) + _MARGIN
+        if not self._balanced:
+            way += duration * abs(rate) * math.hypot(*self.plant.com)
+        if way > self._room:
+            self._room = self._clearance()
+        if way > self._room:
+            return False
+        self._room -= way
+        return True
+
+    def _clearance(self) -> float:
+        """Distance in m from the hull to the nearest obstacle or wall."""
+        scenario, (width, height) = self.scenario, self.scenario.table
+        obstacles = scenario.obstacles
+        x, y = self.state_values()[:2]
+        nearest = min(x, y, width - x, height - y)
+        centres = obstacles.centres_at(self._time) if self._obstacle_speed else obstacles.centres
+        for (cx, cy), radius in zip(centres.tolist(), obstacles.radii.tolist()):
+            nearest = min(nearest, math.hypot(x - cx, y - cy) - radius)
+        return nearest - self.plant.robot.radius
+
+    def _drift(self, duration: float) -> None:
+        x, y, psi, vx, vy, rate = self._free
+        self._free = [x + vx * duration, y + vy * duration, psi + rate * duration, vx, vy, rate]
+        self._time += duration
 
     def _kick(self, dx: float, dy: float, turn: float) -> None:
+        """Changes the velocity of the centre of mass, and the rate."""
+        if self._engaged:
+            self._history.append(("_kick", (dx, dy, turn)))
+            self._kick_body(dx, dy, turn)
+            return
+        free = self._free
+        free[3] += dx
+        free[4] += dy
+        free[5] += turn
+
+    def _half_kick(self, h: float, wrench: list[float]) -> tuple[float, float, float]:
+        """Half of the velocity change of a step of ``h`` seconds under a body wrench."""
+        (fx, fy, torque), (ax, ay) = wrench, self.plant.acceleration
+        robot, (x, y) = self.plant.robot, self.plant.com
+        alpha = (torque - (x * fy - y * fx)) / robot.inertia
+        _, _, psi, _, _, rate = self._centre_of_mass()
+        middle = psi + 0.5 * h * (rate + 0.25 * h * alpha)
+        cos, sin, half = math.cos(middle), math.sin(middle), 0.5 * h
+        gain = half / robot.mass
+        return (
+            gain * (cos * fx - sin * fy) + half * ax,
+            gain * (sin * fx + cos * fy) + half * ay,
+            half * alpha,
+        )
+
+    def _lever(self, psi: float) -> tuple[float, float]:
+        """From the hull's centre to the centre of mass, global frame, in m."""
+        (x, y), cos, sin = self.plant.com, math.cos(psi), math.sin(psi)
+        return cos * x - sin * y, sin * x + cos * y
+
+    # -- contact ---------------------------------------------------------------------------------
+
+    def _engage(self, *flight: Any) -> None:
+        """Hands over to pymunk, which keeps the truth until contacts are over and forgotten."""
+        if flight:
+            self._fly(*flight)
+        self._require_space()
+        self._history = [("_engage", self._flight())]
+        x, y, psi, vx, vy, rate = self._free
+        body = self._body
+        body.angle = psi
+        lx, ly = self._lever(psi)
+        body.position = (x - lx, y - ly)
+        body.velocity, body.angular_velocity = (vx, vy), rate
+        assert self._space is not None
+        self._space.reindex_shapes_for_body(body)
+        self._place_movers()
+        self._engaged, self._steps_apart = True, 0
+
+    def _advance(self, h: float, sub_steps: int, wrenches: list[list[float]] | None) -> None:
+        """Steps of ``h`` seconds in pymunk."""
+        self._history.append(("_advance", (h, sub_steps, wrenches)))
+        self._touched = False
+        for index in range(sub_steps):
+            if wrenches is None:
+                self._step(h)
+            else:
+                half = self._half_kick(h, wrenches[index])
+                self._kick_body(*half)
+                self._step(h)
+                self._kick_body(*half)
+        assert self._space is not None
+        self._steps_apart = 0 if self._touched else self._steps_apart + sub_steps
+        if self._steps_apart > self._space.collision_persistence:
+            self._fly(self._centre_of_mass(), self._time, 0.0)
+
+    def _step(self, h: float) -> None:
+        """One step of Chipmunk, moving obstacles taken along."""
+        assert self._space is not None
+        if self._movers:
+            centres = self.scenario.obstacles.centres_at([self._time, self._time + h]).tolist()
+            for mover, now, then in zip(self._movers, *centres):
+                mover.position = tuple(now)
+                mover.velocity = ((then[0] - now[0]) / h, (then[1] - now[1]) / h)
+        self._space.step(h)
+        self._time += h
+
+    def _kick_body(self, dx: float, dy: float, turn: float) -> None:
         body = self._body
         vx, vy = body.velocity
         body.velocity = (vx + dx, vy + dy)
         body.angular_velocity += turn
 
-    def _add_obstacles(self) -> None:
+    def _centre_of_mass(self) -> list[float]:
+        if not self._engaged:
+            return self._free
+        body = self._body
+        (x, y), angle = body.position, body.angle
+        lx, ly = self._lever(angle)
+        return [x + lx, y + ly, angle, *body.velocity, body.angular_velocity]
+
+    def _place_movers(self) -> None:
+        assert self._space is not None
+        for mover, centre in zip(
+            self._movers, self.scenario.obstacles.centres_at(self._time).tolist()
+        ):
+            mover.position = tuple(centre)
+            self._space.reindex_shapes_for_body(mover)
+
+    def _require_space(self) -> pymunk.Space:
+        """The pymunk space, made when it is first needed."""
+        if self._space is None:
+            self._space = self._make_space()
+        return self._space
+
+    def _make_space(self) -> pymunk.Space:
+        space = pymunk.Space()
+        space.gravity = (0.0, 0.0)
+        # Chipmunk's defaults think in pixels, here distances are in metres: hardly any overlap is
+        # tolerated, and the rest of it is gone after one step.
+        space.collision_slop = 1e-4
+        space.collision_bias = 0.0
+        # The default tree reports pairs in an order that depends on where the robot has been.
+        space.use_spatial_hash(1.0, 100)
+        robot = self.plant.robot
+        self._body = pymunk.Body(robot.mass, robot.inertia)
+        self._body.center_of_gravity = self.plant.com
+        shape = pymunk.Circle(self._body, robot.radius)
+        # Chipmunk multiplies the two shapes' values; the robot's are one.
+        shape.elasticity, shape.friction = 1.0, 1.0
+        shape.collision_type = _ROBOT
+        shape.filter = pymunk.ShapeFilter(categories=_ROBOT_CATEGORY)
+        space.add(self._body, shape)
+        self._add_obstacles(space)
+        self._add_walls(space)
+        return space
+
+    def _add_obstacles(self, space: pymunk.Space) -> None:
         obstacles = self.scenario.obstacles
         for index, (centre, radius) in enumerate(zip(obstacles.centres, obstacles.radii)):
-            shape = pymunk.Circle(self._space.static_body, float(radius), tuple(centre))
-            self._add_static(shape, _FIRST_OBSTACLE + index)
-            self._report(_FIRST_OBSTACLE + index, index)
+            body, place = space.static_body, tuple(centre.tolist())
+            if obstacles.moving:
+                body, place = pymunk.Body(body_type=pymunk.Body.KINEMATIC), (0.0, 0.0)
+                space.add(body)
+                self._movers.append(body)
+            shape = pymunk.Circle(body, float(radius), place)
+            self._add_fixed(space, shape, _FIRST_OBSTACLE + index)
+            self._report(space, _FIRST_OBSTACLE + index, index)
 
-    def _add_walls(self) -> None:
+    def _add_walls(self, space: pymunk.Space) -> None:
         width, height = self.scenario.table
         t = _WALL_THICKNESS
         left, right, low, high = -t, width + t, -t, height + t
         corners = [(left, low), (right, low), (right, high), (left, high)]
         for first, second in zip(corners, corners[1:] + corners[:1]):
-            segment = pymunk.Segment(self._space.static_body, first, second, t)
-            self._add_static(segment, _WALL)
-        self._report(_WALL, "wall")
+            segment = pymunk.Segment(space.static_body, first, second, t)
+            self._add_fixed(space, segment, _WALL)
+        self._report(space, _WALL, "wall")
 
-    def _add_static(self, shape: pymunk.Shape, collision_type: int) -> None:
+    def _add_fixed(self, space: pymunk.Space, shape: pymunk.Shape, collision_type: int) -> None:
         shape.elasticity, shape.friction = self._surface
+        shape.filter = pymunk.ShapeFilter(categories=_SCENE_CATEGORY)
         shape.collision_type = collision_type
-        self._space.add(shape)
+        space.add(shape)
 
-    def _report(self, collision_type: int, name: int | str) -> None:
+    def _report(self, space: pymunk.Space, collision_type: int, name: int | str) -> None:
         """Logs contacts of the robot with shapes of a type under ``name``."""
-        self._space.on_collision(
+        space.on_collision(
             _ROBOT, collision_type, begin=self._began, post_solve=self._solved, data=name
         )
 
@@ -215,3 +435,14 @@ def _replayed(
         getattr(world, name)(*arguments)
     world.contacts = contacts
     return world
+
+
+def _top_speed(obstacles: Obstacles) -> float:
+    """Largest speed in m/s that any obstacle ever has."""
+    if obstacles.waypoints is not None:
+        legs = np.diff(obstacles.waypoints, axis=1)
+        speeds = np.linalg.norm(legs[..., 1:], axis=-1) / legs[..., 0]
+    else:
+        assert obstacles.velocities is not None
+        speeds = np.linalg.norm(obstacles.velocities, axis=-1)
+    return float(speeds.max(initial=0.0))

@@ -1,8 +1,8 @@
-"""Drawing only: a scene as an array of pixels, frames as a GIF.
+"""Drawing only: a scene as an array of pixels, frames as a GIF or in a window.
 
 Everything is drawn three times as large on an off-screen pygame surface and scaled down, which
-smooths all edges; no window, display or video driver is needed. Colours are flat, so that GIFs are
-small.
+smooths all edges; but for :class:`Window` no display or video driver is needed. Colours are flat,
+so that GIFs are small.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def draw_scene(
         gymnasium.error.DependencyNotInstalled: Without pygame (``pip install
             "freeflyer-gym[render]"``).
     """
-    discs = np.column_stack([scenario.obstacles.rows(), scenario.keep_out_radii])
+    discs = np.column_stack([scenario.obstacles.rows()[:, :3], scenario.keep_out_radii])
     table = _table_drawn(tuple(scenario.table), tuple(map(tuple, discs.tolist())), int(width))
     canvas = _Canvas(scenario.table, width, table.copy())
     for ghost, color in ((start, _START), (goal, _GOAL)):
@@ -130,6 +130,38 @@ def save_gif(frames: Sequence[NDArray[np.uint8]], path: str | Path, fps: float =
         duration=10 * max(round(100.0 / fps), 1),
         loop=0,
     )
+
+
+class Window:
+    """A window that shows frames at a steady rate.
+
+    Args:
+        title: Of the window.
+        fps: Frames per second; :meth:`show` waits until the next one is due.
+    """
+
+    def __init__(self, title: str, fps: float) -> None:
+        self._pygame = _import_pygame()
+        self._title, self._fps = title, fps
+        self._screen: Any = None
+        self._clock = self._pygame.time.Clock()
+
+    def show(self, frame: NDArray[np.uint8]) -> None:
+        """Shows a frame ``(H, W, 3)`` uint8."""
+        size = (frame.shape[1], frame.shape[0])
+        if self._screen is None or self._screen.get_size() != size:
+            self._pygame.display.init()
+            self._screen = self._pygame.display.set_mode(size)
+            self._pygame.display.set_caption(self._title)
+        self._pygame.surfarray.blit_array(self._screen, frame.swapaxes(0, 1))
+        self._pygame.event.pump()
+        self._pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """Closes the window."""
+        self._pygame.display.quit()
+        self._screen = None
 
 
 class _Canvas:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -25,18 +26,22 @@ _ON_BOUNDARY = 2e-7  # m: float32 rounding of a start on the boundary is not a v
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Disc obstacles on the table, at rest or in uniform motion.
+    """Disc obstacles on the table: at rest, in uniform motion, or along waypoints.
 
     Attributes:
         centres: ``(M, 2)`` centres at time zero in m, table frame.
         radii: ``(M,)`` radii in m.
-        velocities: ``(M, 2)`` velocities in m/s; zero if left out. Nothing stops a moving obstacle,
-            not even the edge of the table.
+        velocities: ``(M, 2)`` velocities at time zero in m/s; zero if left out. Nothing stops a
+            moving obstacle, not even the edge of the table.
+        waypoints: ``(M, K, 3)`` rows ``(time in s, x, y in m)`` of each obstacle, times ascending;
+            it moves straight and uniformly from one to the next, and rests before the first and
+            after the last. None for uniform motion. See :meth:`along`.
     """
 
     centres: FloatArray
     radii: FloatArray
     velocities: FloatArray | None = None
+    waypoints: FloatArray | None = None
 
     def __post_init__(self) -> None:
         centres = np.array(self.centres, dtype=np.float64).reshape(-1, 2)
@@ -58,23 +63,58 @@ class Obstacles:
         for name, part in (("centres", centres), ("radii", radii), ("velocities", velocities)):
             part.setflags(write=False)
             object.__setattr__(self, name, part)
+        if self.waypoints is not None:
+            waypoints = np.array(self.waypoints, dtype=np.float64)
+            if waypoints.ndim != 3 or len(waypoints) != len(radii) or waypoints.shape[2] != 3:
+                raise ValueError(
+                    f"Obstacles.waypoints must have shape ({len(radii)}, K, 3), rows (time, x, y), "
+                    f"got {waypoints.shape}."
+                )
+            if not np.isfinite(waypoints).all() or (np.diff(waypoints[:, :, 0]) <= 0.0).any():
+                raise ValueError("Obstacles.waypoints must be finite, with ascending times.")
+            waypoints.setflags(write=False)
+            object.__setattr__(self, "waypoints", waypoints)
 
     def __len__(self) -> int:
         return len(self.radii)
 
-    @property
+    @cached_property
     def moving(self) -> bool:
-        """Whether any obstacle moves."""
+        """Whether any obstacle ever moves."""
+        if self.waypoints is not None:
+            return bool(np.any(np.diff(self.waypoints[:, :, 1:], axis=1)))
         return bool(np.any(self.velocities))
 
     def centres_at(self, times: ArrayLike) -> FloatArray:
         """``(..., M, 2)`` centres in m at ``times`` ``(...)`` in s."""
         assert self.velocities is not None
-        return self.centres + np.asarray(times)[..., None, None] * self.velocities
+        times = np.asarray(times, dtype=np.float64)
+        if self.waypoints is None:
+            return self.centres + times[..., None, None] * self.velocities
+        centres = np.empty((*times.shape, len(self), 2))
+        for index, track in enumerate(self.waypoints):
+            for axis in range(2):
+                centres[..., index, axis] = np.interp(times, track[:, 0], track[:, 1 + axis])
+        return centres
 
     def after(self, time: float) -> Obstacles:
         """The obstacles ``time`` seconds later."""
-        return Obstacles(self.centres_at(time), self.radii, self.velocities)
+        if self.waypoints is None:
+            return Obstacles(self.centres_at(time), self.radii, self.velocities)
+        return Obstacles.along(self.waypoints - [time, 0.0, 0.0], self.radii)
+
+    @classmethod
+    def along(cls, waypoints: ArrayLike, radii: ArrayLike) -> Obstacles:
+        """Obstacles that move along waypoints.
+
+        Args:
+            waypoints: ``(M, K, 3)`` rows ``(time, x, y)`` in s, m, m.
+            radii: ``(M,)`` radii in m.
+        """
+        table, radii = np.asarray(waypoints, dtype=np.float64), np.asarray(radii, dtype=np.float64)
+        still = cls(np.zeros((radii.size, 2)), radii, waypoints=table)
+        now, soon = still.centres_at(0.0), still.centres_at(1e-6)
+        return cls(now, radii, np.round((soon - now) / 1e-6, 9), table)
 
     @classmethod
     def from_rows(cls, rows: ArrayLike) -> Obstacles:
@@ -243,16 +283,22 @@ class Problem:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain numbers and lists, for JSON; robot, table and step are not among them."""
-        return {
+        obstacles = self.scenario.obstacles
+        data = {
             "start": self.start.tolist(),
             "goal": self.goal.tolist(),
-            "obstacles": self.scenario.obstacles.rows().tolist(),
+            "obstacles": obstacles.rows().tolist(),
             "final_time": float(self.final_time),
         }
+        if obstacles.waypoints is not None:
+            data["waypoints"] = obstacles.waypoints.tolist()
+        return data
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], scenario: Scenario | None = None) -> Problem:
         """Problem from a mapping with ``start``, ``goal``, ``obstacles`` and ``final_time``.
+
+        With ``waypoints`` too, the obstacles move along them (see :class:`Obstacles`).
 
         Args:
             data: As :meth:`to_dict` gives it; an environment's first observation (with
@@ -268,6 +314,8 @@ class Problem:
             raise ValueError(f"A problem needs {sorted(missing)} too; got {sorted(data)}.")
         try:
             obstacles = Obstacles.from_rows(data["obstacles"])
+            if "waypoints" in data:
+                obstacles = Obstacles.along(data["waypoints"], obstacles.radii)
             scenario = replace(scenario or Scenario(), obstacles=obstacles)
             return cls(scenario, data["start"], data["goal"], float(data["final_time"]))
         except TypeError as error:
@@ -318,6 +366,7 @@ def sample_problem(
     scenario: Scenario | None = None,
     final_time: float = 40.0,
     n_obstacles: int = 4,
+    obstacle_speed: float = 0.0,
 ) -> Problem:
     """A random problem: start region left, goal region right, headings uniform, both at rest.
 
@@ -330,11 +379,19 @@ def sample_problem(
         scenario: The scene; a new one with random obstacles if None (paper, ART-Rs).
         final_time: Final time in s.
         n_obstacles: Number of obstacles of a new scene.
+        obstacle_speed: Largest speed in m/s of the obstacles of a new scene; each moves uniformly
+            in a random direction.
     """
     if scenario is None:
         base = Scenario(obstacles=Obstacles.from_rows([]))
         obstacles = sample_obstacles(rng, n_obstacles, table=base.table)
-        rows = _float32_exact(obstacles.rows())
+        rows = obstacles.rows()
+        if obstacle_speed > 0.0:
+            speed, course = rng.uniform(
+                [[0.0], [-np.pi]], [[obstacle_speed], [np.pi]], (2, len(rows))
+            )
+            rows = np.column_stack([rows, speed * np.cos(course), speed * np.sin(course)])
+        rows = _float32_exact(rows)
         scenario = replace(base, obstacles=Obstacles.from_rows(rows))
     radius, (width, _) = scenario.robot.radius, scenario.table
     if radius > 0.25 or width < 1.0:
@@ -342,21 +399,23 @@ def sample_problem(
             "Random problems need room for start and goal: a robot radius of at most 0.25 m and a "
             f"table at least 1 m long, got {radius} m and {width} m; give a problem instead."
         )
-    start = _sample_state_at_rest(rng, scenario, (radius, 0.5 - radius))
-    goal = _sample_state_at_rest(rng, scenario, (width - 0.5 + radius, width - radius))
+    start = _sample_state_at_rest(rng, scenario, (radius, 0.5 - radius), 0.0)
+    goal_range = (width - 0.5 + radius, width - radius)
+    goal = _sample_state_at_rest(rng, scenario, goal_range, final_time - scenario.dt)
     goal = _float32_exact(unwrap_goal(start, goal))
     return Problem(scenario, start, goal, final_time)
 
 
 def _sample_state_at_rest(
-    rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float]
+    rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float], time: float
 ) -> FloatArray:
     low, high = scenario.position_limits
+    centres = scenario.obstacles.centres_at(time)
     for _ in range(10_000):
         position = np.array([rng.uniform(*x_range), rng.uniform(low[1], high[1])])
         psi = rng.uniform(-np.pi, np.pi)
         state = _float32_exact(np.array([*position, psi, 0.0, 0.0, 0.0]))
-        gaps = np.linalg.norm(state[:2] - scenario.obstacles.centres, axis=1)
+        gaps = np.linalg.norm(state[:2] - centres, axis=1)
         if (gaps > scenario.keep_out_radii).all():
             return state
     raise ValueError(

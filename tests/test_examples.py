@@ -11,12 +11,16 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("[0-9]*.py"))
-ARGUMENTS = {"05_compare_and_fly.py": ["--problems", "6", "--workers", "1"]}
+ARGUMENTS = {
+    "05_compare_and_fly.py": ["--problems", "6", "--workers", "1"],
+    "08_learn_to_dock.py": ["--steps", "4096"],
+    "09_fly_by_hand.py": ["--steps", "20"],
+}
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_example(path, tmp_path):
-    environment = {**os.environ, "MINARI_DATASETS_PATH": str(tmp_path)}
+    environment = {**os.environ, "SDL_VIDEODRIVER": "dummy", "MINARI_DATASETS_PATH": str(tmp_path)}
     result = subprocess.run(
         [sys.executable, str(path), *ARGUMENTS.get(path.name, [])],
         cwd=tmp_path,

@@ -3,6 +3,7 @@
 import copy
 import pickle
 import warnings
+from dataclasses import replace
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +19,9 @@ from freeflyer_env import (
     dynamics,
     sample_problem,
 )
+from freeflyer_env.env import ERROR_WEIGHTS
 from freeflyer_env.planning import solve_multistart
+from freeflyer_env.spaces import obstacle_mask
 
 MODES = ["delta_v", "thrusters", "on_off"]
 
@@ -202,7 +205,18 @@ def test_problems_can_be_given_as_mappings_or_observations():
         ({"scenario": "nominal", "max_obstacles": 2}, "at least the scene's 4"),
         ({"final_time": 300.0}, "at most 200 s"),
         ({"scenario": [[4.0, 1.0, 0.1]]}, "obstacles is outside the observation space"),
-        ({"render_mode": "ansi"}, "render_mode must be None or 'rgb_array'"),
+        ({"render_mode": "ansi"}, "render_mode must be None, 'rgb_array' or 'human'"),
+        ({"reward": "dens"}, "Did you mean 'dense'"),
+        ({"observation": ("state", "lidr")}, "Did you mean 'lidar'"),
+        ({"observation": ()}, "observation must be one of"),
+        ({"n_obstacles": (3, 2)}, "n_obstacles must be a number >= 0 or a range"),
+        ({"obstacle_speed": 2.0}, r"obstacle_speed must be in \[0, 1\] m/s"),
+        ({"image_size": (4, 100)}, "image_size must be"),
+        ({"lidar_rays": 0}, "lidar_rays must be at least 1"),
+        ({"disturbances": "test"}, "disturbances must be 'testbed'"),
+        ({"disturbances": {"position_nose": 1.0}}, "Did you mean 'position_noise'"),
+        ({"disturbances": {"delay": -1}}, "delay must be an integer >= 0"),
+        ({"disturbances": {"mass_error": 0.5}}, "mass_error is relative and at most 0.2"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:.*render_mode='ansi'")
@@ -259,7 +273,7 @@ def test_arguments_can_be_stored_in_a_spec():
 def test_without_contacts_the_episode_ends_where_the_table_does():
     env = make(scenario=[[1.0, 1.2, 0.2]], contacts=False)
     scenario = env.unwrapped.scenario
-    problem = Problem(scenario, [0.5, 1.2, 0, 0.2, 0, 0], [3.2, 1.2, 0, 0, 0, 0], 40.0)
+    problem = Problem(scenario, [0.45, 1.2, 0, 0.2, 0, 0], [3.2, 1.2, 0, 0, 0, 0], 40.0)
     env.reset(options={"problem": problem})
     truncated, steps = False, 0
     while not truncated:
@@ -269,7 +283,7 @@ def test_without_contacts_the_episode_ends_where_the_table_does():
         assert info["contacts"]["count"] == 0
         steps += 1
     assert steps == 31
-    assert env.unwrapped.state[0] == pytest.approx(3.6)
+    assert env.unwrapped.state[0] == pytest.approx(3.55)
 
 
 def test_the_propellant_of_the_thruster_modes_is_the_cost():
@@ -331,7 +345,128 @@ def test_success_is_paid_once():
         assert env.step(np.zeros(3))[1] == 0.0
 
 
-def test_moving_obstacles_are_refused():
+def test_moving_obstacles_need_an_environment_made_for_them():
     obstacles = Obstacles(np.array([[1.5, 1.0]]), [0.2], [[0.0, 0.1]])
-    with pytest.raises(ValueError, match="obstacles are at rest"):
-        gym.make("FreeFlyer-v0", scenario=Scenario(obstacles))
+    problem = Problem(Scenario(obstacles), [0.3, 1, 0, 0, 0, 0], [3.2, 1, 0, 0, 0, 0])
+    with pytest.raises(ValueError, match="moving_obstacles=True"):
+        make().reset(options={"problem": problem})
+    observation, _ = make(moving_obstacles=True).reset(options={"problem": problem})
+    np.testing.assert_allclose(observation["obstacles"][0], [1.5, 1.0, 0.2, 0.0, 0.1], atol=1e-6)
+
+
+def test_observed_obstacles_move_with_those_on_the_table():
+    track = [[0.0, 1.5, 1.0], [10.0, 1.5, 2.0], [15.0, 2.0, 2.0]]
+    obstacles = Obstacles.along([track], [0.2])
+    env = make(scenario=Scenario(obstacles), final_time=20.0, observation=("state", "lidar"))
+    env.reset(seed=0)
+    for step in range(1, 41):
+        observation = env.step(np.zeros(3))[0]
+        expected = obstacles.centres_at(0.5 * step)[0]
+        np.testing.assert_allclose(observation["obstacles"][0, :2], expected, atol=1e-6)
+        assert env.observation_space.contains(observation)
+    assert not observation["obstacles"][0, 3:].any()
+    assert (
+        Problem.from_dict(env.unwrapped.problem.to_dict()).scenario.obstacles.waypoints is not None
+    )
+
+
+def test_random_obstacles_vary_in_number_and_move():
+    env = make(n_obstacles=(0, 6), obstacle_speed=0.05)
+    counts, speeds = set(), []
+    for seed in range(40):
+        observation, _ = env.reset(seed=seed)
+        assert env.observation_space.contains(observation)
+        mask = obstacle_mask(observation["obstacles"])
+        counts.add(int(mask.sum()))
+        speeds += np.linalg.norm(observation["obstacles"][mask, 3:], axis=1).tolist()
+    assert counts == set(range(7))
+    assert 0.0 < max(speeds) <= 0.05 + 1e-6
+
+
+def test_contact_may_end_the_episode():
+    problem = Problem(
+        Scenario(Obstacles.from_rows([[1.0, 1.2, 0.2]])),
+        [0.4, 1.2, 0, 0.2, 0, 0],
+        [3.2, 1.2, 0, 0, 0, 0],
+    )
+    env = make(terminate_on_contact=True)
+    env.reset(options={"problem": problem})
+    for _ in range(3):
+        *_, terminated, truncated, info = env.step(np.zeros(3))
+    assert terminated
+    assert not truncated
+    assert not info["is_success"]
+    assert info["contacts"]["with"] == [0]
+
+
+def test_the_dense_reward_telescopes():
+    """Shaping adds up to the fall of the potential, whatever way is flown."""
+    returns = {}
+    for reward in ("paper", "dense"):
+        env = make(reward=reward, final_time=10.0)
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        error = np.array(env.unwrapped._goal_error(env.unwrapped.state.tolist()))
+        steps = [env.step(env.action_space.sample()) for _ in range(20)]
+        returns[reward] = sum(step[1] for step in steps)
+        fall = (error - np.array(steps[-1][4]["goal_error"])) @ ERROR_WEIGHTS
+    assert returns["dense"] - returns["paper"] == pytest.approx(fall, abs=1e-9)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_snapshot_replays_bit_for_bit(mode):
+    """Also from a moment right after a contact, and with noise."""
+    scenario = [[0.62, 0.7, 0.2], [0.62, 1.2, 0.2], [0.62, 1.8, 0.2]]
+    env = make(
+        action_mode=mode, scenario=scenario, disturbances="testbed", observation=("state", "lidar")
+    ).unwrapped
+    problem = Problem(
+        replace(env.scenario), [0.25, 0.95, 0, 0.3, 0.1, 0.3], [3.2, 1.2, 0, 0, 0, 0], 40.0
+    )
+    env.reset(seed=1, options={"problem": problem})
+    env.action_space.seed(1)
+    actions = [env.action_space.sample() for _ in range(60)]
+
+    def fly(actions):
+        results = [env.step(action) for action in actions]
+        observed = b"".join(v.tobytes() for r in results for v in r[0].values())
+        return observed, [r[1] for r in results], env.state.tobytes()
+
+    contacts, snapshots = 0, []
+    for action in actions[:20]:
+        snapshots.append((env.save(), contacts))
+        contacts += env.step(action)[4]["contacts"]["count"]
+    assert contacts > 0
+    for start, (snapshot, _) in enumerate(snapshots):
+        env.restore(snapshot)
+        first = fly(actions[start:])
+        env.restore(snapshot)
+        assert fly(actions[start:]) == first
+    with pytest.raises(ValueError, match=r"what save\(\) gave"):
+        env.restore({})
+
+
+def test_the_window_shows_the_picture(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    env = make(render_mode="human", final_time=1.0)
+    env.metadata["render_fps"] = 1000
+    env.reset(seed=0)
+    env.step(np.zeros(3))
+    assert env.render() is None
+    pickle.loads(pickle.dumps(env.unwrapped))
+    env.close()
+
+
+def test_frames_are_collected_and_recorded(tmp_path):
+    env = make(render_mode="rgb_array_list", final_time=2.0)
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.zeros(3))
+    assert len(env.render()) == 5
+    pytest.importorskip("moviepy")
+    env = gym.wrappers.RecordVideo(make(render_mode="rgb_array", final_time=2.0), str(tmp_path))
+    env.reset(seed=0)
+    for _ in range(4):
+        env.step(np.zeros(3))
+    env.close()
+    assert [path.suffix for path in tmp_path.glob("*.mp4")] == [".mp4"]

@@ -118,3 +118,66 @@ def test_without_contacts_it_passes_through():
 def test_bad_surface(name):
     with pytest.raises(ValueError, match=name):
         World(EMPTY, **{name: 1.5})
+
+
+def test_free_flight_and_pymunk_agree():
+    """A world that pymunk has from the start takes the same way as one in closed form."""
+    free, engaged = World(EMPTY), World(EMPTY)
+    rng = np.random.default_rng(0)
+    for world in (free, engaged):
+        world.state = [1.5, 1.2, 0.3, 0.02, -0.01, 0.1]
+    engaged._engage()
+    engaged._require_space().collision_persistence = 10**6  # it is never handed back
+    for _ in range(20):
+        wrenches = rng.uniform(-1, 1, (10, 3)) * [0.4, 0.4, 0.04]
+        for world in (free, engaged):
+            world.advance(0.1, 10, wrenches)
+            world.advance(0.5, 10)
+        np.testing.assert_allclose(free.state, engaged.state, atol=1e-12)
+    assert engaged._engaged
+    assert not free._engaged
+
+
+def test_a_moving_disc_pushes_the_robot():
+    obstacles = Obstacles(np.array([[1.0, 1.2]]), [0.2], [[0.1, 0.0]])
+    world = World(Scenario(obstacles), restitution=1.0)
+    world.state = [1.5, 1.2, 0.0, 0.0, 0.0, 0.0]
+    world.advance(1.0, 100)
+    assert world.state[3] == 0.0
+    world.advance(1.0, 100)
+    assert world.state[3] == pytest.approx(0.2, abs=1e-9)
+    world.advance(3.0, 100)
+    assert world.state[0] == pytest.approx(1.5 + 0.2 * 3.5, abs=2e-3)
+    assert world.take_contacts().to_info()["with"] == [0]
+
+
+def test_a_copy_made_while_an_obstacle_pushes_goes_the_same_way():
+    track = [[[0.0, 1.0, 1.2], [2.0, 1.3, 1.3], [5.0, 1.0, 1.0]]]
+    world = World(Scenario(Obstacles.along(track, [0.2])), restitution=0.0, friction=0.5)
+    world.state = [1.4, 1.2, 0.0, 0.0, 0.0, 0.1]
+    for _ in range(25):
+        world.advance(0.1, 10)
+        twin = copy.deepcopy(world)
+        for _ in range(10):
+            twin.advance(0.1, 10)
+        ahead = copy.deepcopy(world)
+        for _ in range(10):
+            ahead.advance(0.1, 10)
+        np.testing.assert_array_equal(twin.state, ahead.state)
+    assert world.take_contacts().count > 0
+
+
+def test_collisions_conserve_angular_momentum_about_the_contact():
+    """Friction acts at the point of contact, so it cannot change the moment about it."""
+    world = World(Scenario(Obstacles.from_rows([[2.0, 1.25, 0.2]])), friction=1.0)
+    world.state = [1.4, 1.25, 0.0, 0.1, 0.0, 2.0]
+
+    def moment(state):
+        lever = state[:2] - np.array([1.8, 1.25])
+        return ROBOT.mass * (lever[0] * state[4] - lever[1] * state[3]) + ROBOT.inertia * state[5]
+
+    before = moment(world.state)
+    world.advance(4.0, 4000)
+    assert world.take_contacts().count == 1
+    assert world.state[4] != 0.0
+    assert moment(world.state) == pytest.approx(before, abs=1e-3)
