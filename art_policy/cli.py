@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -219,21 +220,29 @@ def _download(options: argparse.Namespace) -> None:
 
 def _info(options: argparse.Namespace) -> None:
     from art_policy.model import ART, shipped_models
+    from freeflyer_datasets import list_recipes
+    from freeflyer_datasets.describe import describe, describe_text, list_local
 
-    if options.name is None:
+    name, models = options.name, shipped_models()
+    data: dict[str, Any]
+    if name and re.search(r"-v\d+$", name) and not Path(name).exists():
+        data = describe(name)
+        print_result(options, data, describe_text(data))
+        return
+    if name is None:
         import freeflyer_env
-        from freeflyer_datasets import list_recipes
 
-        data: dict[str, Any] = {
+        data = {
             "version": freeflyer_env.__version__,
-            "models": shipped_models(),
+            "models": models,
+            "datasets": list_local(),
             "recipes": list_recipes(),
             "scenes": list(freeflyer_env.SCENES),
         }
     else:
-        model = ART.from_pretrained(options.name)
+        model = ART.from_pretrained(name)
         data = {
-            "model": options.name,
+            "model": name,
             "parameters": model.num_parameters,
             "config": model.config.to_dict(),
         }
@@ -322,8 +331,8 @@ def _parser() -> argparse.ArgumentParser:
         if name == "download":
             sub.add_argument("--force", action="store_true", help="replace a local dataset")
 
-    sub = command("info", _info, "What is installed, or a model's description.")
-    sub.add_argument("name", nargs="?", help="a model")
+    sub = command("info", _info, "What is installed, or what a model or a dataset is.")
+    sub.add_argument("name", nargs="?", help="a model, or a local dataset's Minari id")
     return parser
 
 

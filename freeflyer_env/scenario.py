@@ -7,6 +7,7 @@ adds a start, a goal and a final time. The paper's scenes are in :data:`SCENES`,
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -347,18 +348,28 @@ def sample_obstacles(
     Raises:
         ValueError: If so many discs do not fit.
     """
-    rows: list[FloatArray] = []
+    return Obstacles.from_rows(_sample_discs(rng, n_obstacles, radius_range, table))
+
+
+def _sample_discs(
+    rng: np.random.Generator,
+    n_obstacles: int,
+    radius_range: tuple[float, float],
+    table: tuple[float, float],
+) -> FloatArray:
+    """Rows ``(x, y, radius)`` of :func:`sample_obstacles`."""
+    rows: list[tuple[float, float, float]] = []
     for _ in range(10_000):
         if len(rows) == n_obstacles:
             break
         radius = rng.uniform(*radius_range)
         x = rng.uniform(0.5, table[0] - 0.5)
-        row = np.array([x, rng.uniform(radius, table[1] - radius), radius])
-        if all(np.hypot(*(row[:2] - other[:2])) > radius + other[2] for other in rows):
-            rows.append(row)
+        y = rng.uniform(radius, table[1] - radius)
+        if all(math.hypot(x - other[0], y - other[1]) > radius + other[2] for other in rows):
+            rows.append((x, y, radius))
     if len(rows) < n_obstacles:
         raise ValueError(f"Could not place {n_obstacles} obstacles on the table; ask for fewer.")
-    return Obstacles.from_rows(np.array(rows).reshape(-1, 3))
+    return np.array(rows).reshape(-1, 3)
 
 
 def sample_problem(
@@ -383,16 +394,14 @@ def sample_problem(
             in a random direction.
     """
     if scenario is None:
-        base = Scenario(obstacles=Obstacles.from_rows([]))
-        obstacles = sample_obstacles(rng, n_obstacles, table=base.table)
-        rows = obstacles.rows()
+        rows = _sample_discs(rng, n_obstacles, (0.1, 0.2), Scenario.table)
         if obstacle_speed > 0.0:
             speed, course = rng.uniform(
                 [[0.0], [-np.pi]], [[obstacle_speed], [np.pi]], (2, len(rows))
             )
             rows = np.column_stack([rows, speed * np.cos(course), speed * np.sin(course)])
         rows = _float32_exact(rows)
-        scenario = replace(base, obstacles=Obstacles.from_rows(rows))
+        scenario = Scenario(Obstacles.from_rows(rows))
     radius, (width, _) = scenario.robot.radius, scenario.table
     if radius > 0.25 or width < 1.0:
         raise ValueError(
@@ -409,14 +418,14 @@ def sample_problem(
 def _sample_state_at_rest(
     rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float], time: float
 ) -> FloatArray:
-    low, high = scenario.position_limits
+    low, high = (limit[1] for limit in scenario.position_limits)
     centres = scenario.obstacles.centres_at(time)
+    keep_out = scenario.keep_out_radii
     for _ in range(10_000):
-        position = np.array([rng.uniform(*x_range), rng.uniform(low[1], high[1])])
-        psi = rng.uniform(-np.pi, np.pi)
-        state = _float32_exact(np.array([*position, psi, 0.0, 0.0, 0.0]))
+        pose = [rng.uniform(*x_range), rng.uniform(low, high), rng.uniform(-np.pi, np.pi)]
+        state = _float32_exact(np.array([*pose, 0.0, 0.0, 0.0]))
         gaps = np.linalg.norm(state[:2] - centres, axis=1)
-        if (gaps > scenario.keep_out_radii).all():
+        if (gaps > keep_out).all():
             return state
     raise ValueError(
         f"The obstacles leave no free place with x in {x_range} m; use other obstacles."

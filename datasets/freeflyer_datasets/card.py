@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +16,11 @@ from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP, Shard
 
 #: Smallest ``C_REL`` of each class of difficulty (paper, Fig. 3).
 C_REL_CLASSES = (0, 5, 10, 15, 20)
+
+_CAPTIONS = {
+    "histograms.png": "Costs, iterations, C_REL",
+    "trajectories.png": "Sixteen problems with their trajectories",
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +55,25 @@ class Statistics:
     def n_trajectories(self) -> int:
         """Number of episodes."""
         return len(self.rel_cost) + len(self.scp_iterations)
+
+    def summary(self) -> dict[str, Any]:
+        """Plain numbers, for a dataset's metadata; shares with their 95 % interval."""
+        solved = self.solved
+        return {
+            "problems": self.n_problems,
+            "failed": self.n_failed,
+            "episodes": {"REL": len(self.rel_cost), "SCP": len(self.scp_iterations)},
+            "steps": self.n_steps,
+            "rel_feasible": share(self.c_rel == 0),
+            "with_optimum": share(solved),
+            "rel_cost": quantiles(self.rel_cost),
+            "best_cost": quantiles(self.best_cost[solved]),
+            "best_over_rel": quantiles(self.best_cost[solved] / self.rel_cost[solved]),
+            "c_rel": quantiles(self.c_rel),
+            "rel_iterations": quantiles(self.rel_iterations),
+            "scp_iterations": quantiles(self.scp_iterations),
+            "largest_violation": self.violation,
+        }
 
     @property
     def solved(self) -> NDArray[np.bool_]:
@@ -87,18 +114,52 @@ def _shard_columns(shard: Shard) -> dict[str, np.ndarray]:
     }
 
 
-def dataset_card(recipe: Recipe, statistics: Statistics, version: str) -> str:
-    """The card as Markdown.
+def wilson_interval(n_successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
+    """Wilson's interval of a proportion; 95 % for ``z = 1.96``, (0, 1) without observations."""
+    if n == 0:
+        return 0.0, 1.0
+    p, extra = n_successes / n, z * z / n
+    middle = (p + extra / 2) / (1 + extra)
+    half = z / (1 + extra) * float(np.sqrt(p * (1 - p) / n + extra / (4 * n)))
+    return max(middle - half, 0.0), min(middle + half, 1.0)
+
+
+def share(mask: NDArray[np.bool_]) -> list[float]:
+    """``[share, lower, upper]`` of what is true, with the 95 % interval."""
+    low, high = wilson_interval(int(mask.sum()), len(mask))
+    return [float(mask.mean()) if len(mask) else float("nan"), low, high]
+
+
+def quantiles(values: NDArray[Any]) -> list[float]:
+    """``[5 %, 50 %, 95 %, mean]``; empty without values."""
+    if not len(values):
+        return []
+    return [*np.quantile(values, [0.05, 0.5, 0.95]).tolist(), float(np.mean(values))]
+
+
+def dataset_card(
+    recipe: Recipe,
+    statistics: Statistics,
+    version: str,
+    n_bytes: int,
+    pictures: Sequence[str] = (),
+) -> str:
+    """The card as Markdown, with the front matter of the Hugging Face hub.
 
     Args:
         recipe: How the dataset was made.
         statistics: What is in it.
         version: Version of ``freeflyer-gym`` that made it.
+        n_bytes: Size of the data.
+        pictures: Files beside the card to show.
     """
     s, name = statistics, recipe.id.rsplit("/", 1)[-1]
+    shown = "\n\n".join(f"![{_CAPTIONS.get(file, file)}]({file})" for file in pictures)
     return f"""---
 license: mit
+viewer: false
 tags: [minari, offline-rl, trajectory-optimization, spacecraft]
+size_categories: [{_size_category(s.n_trajectories)}]
 ---
 
 # {recipe.id}
@@ -115,9 +176,17 @@ dataset = minari.load_dataset("{recipe.id}")
 env = dataset.recover_environment()
 ```
 
+{shown}
+
 ## Contents
 
-{_contents(recipe, s)}
+{_contents(recipe, s, n_bytes)}
+
+## Feasibility
+
+Shares with their 95 % interval (Wilson).
+
+{_feasibility(s)}
 
 ## Difficulty
 
@@ -135,22 +204,58 @@ Split by the attribute `problem_index`, never by episode.
 
 ## How it was made
 
-With freeflyer-gym {version}, seed {recipe.seed}, recipe `{name}`:
-`freeflyer_datasets.build("{name}")` makes it again.
+With freeflyer-gym {version} from this recipe, which makes it again
+(`freeflyer generate {name}.toml`):
+
+```toml
+{recipe_toml(recipe, s.n_problems)}
+```
+
 SCP was started from {_starts(recipe)}.
 Kept is {_kept(recipe)} of each problem.
 Every trajectory was checked against the constraints by code that the solver does not share; the
 largest violation, with float32 actions, is {s.violation:.1e}.
+Exported with {_versions()}.
 
 ## Licence and citation
 
-MIT. Please cite freeflyer-gym, and the paper whose method and protocol this follows: D. Celestini,
-A. Afsharrad, D. Gammelli, T. Guffanti, G. Zardini, S. Lall, E. Capello, S. D'Amico, M. Pavone,
-"Generalizable Spacecraft Trajectory Generation via Multimodal Learning with Transformers".
+MIT. Please cite the software, and the paper whose method and protocol this follows:
+
+```bibtex
+@software{{freeflyer_gym,
+  title   = {{FreeFlyer / ART: learned warm starts for spacecraft trajectory optimisation}},
+  author  = {{{{The FreeFlyer developers}}}},
+  version = {{{version}}},
+}}
+
+@misc{{celestini_art,
+  title  = {{Generalizable Spacecraft Trajectory Generation via Multimodal Learning with
+            Transformers}},
+  author = {{Celestini, Davide and Afsharrad, Amirhossein and Gammelli, Daniele and
+            Guffanti, Tommaso and Zardini, Gioele and Lall, Sanjay and Capello, Elisa and
+            D'Amico, Simone and Pavone, Marco}},
+}}
+```
 """
 
 
-def _contents(recipe: Recipe, s: Statistics) -> str:
+def recipe_toml(recipe: Recipe, n_problems: int) -> str:
+    """The recipe as TOML, with the number of problems that were made."""
+    fields = {**recipe.to_dict(), "n_problems": n_problems}
+    times = list(recipe.final_times)
+    if len(times) > 6 and np.allclose(np.diff(times), 0.5):
+        fields["final_times"] = {"range": [times[0], times[-1]]}
+    # Strings, numbers and lists of them look the same in TOML and in JSON.
+    lines = [
+        f"{key} = {json.dumps(value)}"
+        if not isinstance(value, dict)
+        else f"{key} = {{ range = {json.dumps(value['range'])} }}"
+        for key, value in fields.items()
+    ]
+    return "\n".join(lines)
+
+
+def _contents(recipe: Recipe, s: Statistics, n_bytes: int) -> str:
     times = recipe.final_times
     if len(times) > 6:
         final_times = f"{min(times):g} to {max(times):g} ({len(times)} values)"
@@ -164,7 +269,8 @@ def _contents(recipe: Recipe, s: Statistics) -> str:
         ("steps", f"{s.n_steps:,}"),
         ("scenes", "random" if recipe.scenes == "random" else ", ".join(recipe.scenes)),
         ("final times in s", final_times),
-        ("problems with an optimum", f"{_percent(solved)}"),
+        ("size in MB", f"{n_bytes / 1e6:,.1f}"),
+        ("size of an episode in kB", f"{n_bytes / max(s.n_trajectories, 1) / 1e3:.1f}"),
         ("optima per problem", f"{_mean(s.n_optima)}"),
         ("cost of REL in m/s", _quantiles(s.rel_cost)),
         ("cost of the cheapest optimum in m/s", _quantiles(s.best_cost[solved])),
@@ -184,6 +290,40 @@ def _difficulty(s: Statistics) -> str:
         ratio = s.best_cost[solved] / s.rel_cost[solved]
         rows.append((f">= {least}", _percent(mask), _percent(s.solved[mask]), _mean(ratio)))
     return _table(("C_REL", "problems", "with an optimum", "best cost / REL cost"), rows)
+
+
+def _feasibility(s: Statistics) -> str:
+    rows = []
+    for what, mask in (
+        ("REL trajectories that keep out of the obstacles", s.c_rel == 0),
+        ("problems with an SCP optimum", s.solved),
+        ("problems with several", s.n_optima > 1),
+    ):
+        part, low, high = share(mask)
+        interval = f"{100 * low:.2f} to {100 * high:.2f} %"
+        rows.append(
+            (what, f"{int(mask.sum()):,} of {len(mask):,}", f"{100 * part:.2f} %", interval)
+        )
+    return _table(("", "count", "share", "interval"), rows)
+
+
+def _versions() -> str:
+    import platform
+
+    parts = [f"Python {'.'.join(platform.python_version_tuple()[:2])}"]
+    for package in ("numpy", "piqp", "gymnasium", "minari"):
+        try:
+            parts.append(f"{package} {metadata.version(package)}")
+        except metadata.PackageNotFoundError:
+            continue
+    return ", ".join(parts)
+
+
+def _size_category(n_episodes: int) -> str:
+    for power, name in ((3, "n<1K"), (4, "1K<n<10K"), (5, "10K<n<100K"), (6, "100K<n<1M")):
+        if n_episodes < 10**power:
+            return name
+    return "1M<n<10M"
 
 
 def _starts(recipe: Recipe) -> str:

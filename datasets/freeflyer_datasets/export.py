@@ -20,6 +20,7 @@ from tqdm import tqdm
 import freeflyer_env
 from freeflyer_datasets.card import Statistics, dataset_card
 from freeflyer_datasets.generate import generate
+from freeflyer_datasets.pictures import draw_pictures
 from freeflyer_datasets.recipe import Recipe, load_recipe
 from freeflyer_datasets.shards import Shard, iterate_shards, source_digest
 from freeflyer_datasets.storage import (
@@ -47,7 +48,7 @@ class Credits:
     """
 
     author: str = "The FreeFlyer developers"
-    author_email: str = f"see the metadata of the package {_PACKAGE}"
+    author_email: str = f"through the issues of {_PACKAGE}"
     code_permalink: str = f"{_PACKAGE}=={freeflyer_env.__version__}"
 
 
@@ -193,7 +194,9 @@ def _write_dataset(
             **_metadata(recipe, statistics, credits),
         }
     )
-    card = dataset_card(recipe, statistics, freeflyer_env.__version__)
+    pictures = draw_pictures(folder, statistics, next(iterate_shards(shards, n_problems)))
+    n_bytes = (folder / "data" / "main_data.hdf5").stat().st_size
+    card = dataset_card(recipe, statistics, freeflyer_env.__version__, n_bytes, pictures)
     (folder / "README.md").write_text(card, encoding="utf-8")
 
 
@@ -213,7 +216,8 @@ def _metadata(recipe: Recipe, statistics: Statistics, credits: Credits) -> dict[
         "ref_min_score": _random_score(evaluation),
         "ref_max_score": float(np.mean(best)),
         "num_episodes_average_score": _N_REFERENCE_EPISODES,
-        "recipe": recipe.to_dict(),
+        "recipe": {**recipe.to_dict(), "n_problems": statistics.n_problems},
+        "statistics": statistics.summary(),
         "episode_attributes": EPISODE_ATTRIBUTES,
     }
 
