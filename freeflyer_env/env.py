@@ -42,9 +42,9 @@ REWARDS = ("paper", "dense")
 #: Weights of the errors in position, heading, speed and rate in the dense reward, in 1/m, 1/rad ...
 ERROR_WEIGHTS = (1.0, 0.2, 2.0, 0.2)
 
-# Impulses this much over the thrusters' reach still pass: plans are exact to a solver's tolerance
-# only, and have to be replayed exactly.
-_REACH_TOLERANCE = 1e-3
+#: Impulses this much over the thrusters' reach still pass: plans are exact to a solver's tolerance
+#: only, and have to be replayed exactly.
+REACH_TOLERANCE = 1e-3
 
 _MAX_OBSTACLES = 4
 
@@ -245,10 +245,10 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             n_obstacles = (
                 _MAX_OBSTACLES if max_obstacles is None else min(max_obstacles, _MAX_OBSTACLES)
             )
-        self.obstacle_speed, self.n_obstacles = float(obstacle_speed), obstacle_count(n_obstacles)
-        self._fixed_scenario = fixed_scenario(scenario)
-        self._base = base = self._fixed_scenario or Scenario()
-        most = len(base.obstacles) if self._fixed_scenario else self.n_obstacles[1]
+        self.obstacle_speed, self.n_obstacles = float(obstacle_speed), _obstacle_range(n_obstacles)
+        self.fixed_scenario = _scenario(scenario)
+        self.base_scenario = base = self.fixed_scenario or Scenario()
+        most = len(base.obstacles) if self.fixed_scenario else self.n_obstacles[1]
         self.max_obstacles = max(most, _MAX_OBSTACLES) if max_obstacles is None else max_obstacles
         if self.max_obstacles < most:
             raise ValueError(
@@ -256,7 +256,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             )
         if moving_obstacles is None:
             moving_obstacles = bool(
-                base.obstacles.moving if self._fixed_scenario else self.obstacle_speed
+                base.obstacles.moving if self.fixed_scenario else self.obstacle_speed
             )
         self.moving_obstacles = moving_obstacles
         self.control_dt = base.dt if action_mode == "delta_v" else PWM_PERIOD
@@ -270,8 +270,8 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         self.observation_space: spaces.Dict = observation_space(
             base, self.max_obstacles, self.modalities, **sizes
         )
-        self._limits = observation_space(base, self.max_obstacles, **sizes)
-        low, high = (getattr(self._limits["state"], name).tolist() for name in ("low", "high"))
+        self.limits = observation_space(base, self.max_obstacles, **sizes)
+        low, high = (getattr(self.limits["state"], name).tolist() for name in ("low", "high"))
         self._state_limits = list(zip(low, high))
         self._keys, self._thrust = tuple(self.observation_space), base.robot.thrust
         self._rays, self._image_size = lidar_angles(lidar_rays), image_size
@@ -282,7 +282,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         self._step_count = 0
         # A problem to show before the first reset, and an early error for arguments that are wrong.
         self.problem = self._sample_problem(np.random.default_rng(0))
-        require_fit(self.problem, base, self._limits)
+        require_fit(self.problem, base, self.limits)
         self._make_world(None)
 
     @property
@@ -475,7 +475,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         cos, sin = math.cos(psi), math.sin(psi)
         body = (cos * ux + sin * uy, cos * uy - sin * ux, turn)
         excess = robot.reach_of_one(*body, period)
-        if excess > 1.0 + _REACH_TOLERANCE:
+        if excess > 1.0 + REACH_TOLERANCE:
             ux, uy, turn = ux / excess, uy / excess, turn / excess
             body = (body[0] / excess, body[1] / excess, turn)
         force = robot.mass / period
@@ -503,18 +503,18 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             raise ValueError(
                 f"A problem must be a Problem or a mapping, got {type(given).__name__}."
             )
-        problem = given if isinstance(given, Problem) else Problem.from_dict(given, self._base)
-        require_fit(problem.require_valid(), self._base, self._limits)
+        problem = (
+            given if isinstance(given, Problem) else Problem.from_dict(given, self.base_scenario)
+        )
+        require_fit(problem.require_valid(), self.base_scenario, self.limits)
         return problem
 
     def _sample_problem(self, rng: np.random.Generator) -> Problem:
         least, most = self.n_obstacles
         count = least
-        if self._fixed_scenario is None and most > least:
+        if self.fixed_scenario is None and most > least:
             count = int(rng.integers(least, most + 1))
-        return sample_problem(
-            rng, self._fixed_scenario, self.final_time, count, self.obstacle_speed
-        )
+        return sample_problem(rng, self.fixed_scenario, self.final_time, count, self.obstacle_speed)
 
     def _observation(self, state: list[float]) -> dict[str, Any]:
         noise, values = self.disturbances, state
@@ -543,7 +543,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
                     self.problem.goal[:3],
                     self._present_rows(),
                     self._image_size,
-                    self._base.table,
+                    self.base_scenario.table,
                     self.robot.radius,
                 )
             else:
@@ -559,14 +559,14 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         if not obstacles.moving:
             return self._rows
         rows = obstacle_rows(obstacles, self.max_obstacles, True, self.time)
-        box: Any = self._limits["obstacles"]
+        box: Any = self.limits["obstacles"]
         return np.clip(rows, box.low, box.high)
 
     def _off_table(self, state: list[float]) -> bool:
         """Whether the centre has left the table, as it can where there are no contacts."""
         if self.contacts:
             return False
-        x, y, (width, height) = state[0], state[1], self._base.table
+        x, y, (width, height) = state[0], state[1], self.base_scenario.table
         return not (0.0 <= x <= width and 0.0 <= y <= height)
 
     def _goal_error(self, state: list[float]) -> tuple[float, float, float, float]:
@@ -605,7 +605,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         return self._world
 
 
-def fixed_scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
+def _scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
     """The scenario that an environment's argument names; None for random ones."""
     if isinstance(given, Scenario):
         return given
@@ -614,7 +614,7 @@ def fixed_scenario(given: str | Scenario | list[list[float]]) -> Scenario | None
     return None if given == "random" else Scenario.named(given)
 
 
-def obstacle_count(given: int | tuple[int, int]) -> tuple[int, int]:
+def _obstacle_range(given: int | tuple[int, int]) -> tuple[int, int]:
     """The range ``(least, most)`` that the argument ``n_obstacles`` means."""
     least, most = (given, given) if isinstance(given, int | np.integer) else given
     if not 0 <= least <= most:

@@ -25,6 +25,9 @@ from freeflyer_env.scenario import Obstacles, Scenario
 
 _WALL_THICKNESS = 0.5  # m: thick enough that nothing tunnels through
 _ROBOT, _WALL, _FIRST_OBSTACLE = 1, 2, 3
+#: Overlap in m that is not pushed out.
+COLLISION_SLOP = 1e-4
+
 _SCENE_CATEGORY, _ROBOT_CATEGORY = 0b01, 0b10
 _MARGIN = 1e-6  # m between hull and surroundings below which pymunk takes over
 
@@ -364,7 +367,7 @@ class World:
         space.gravity = (0.0, 0.0)
         # Chipmunk's defaults think in pixels, here distances are in metres: hardly any overlap is
         # tolerated, and the rest of it is gone after one step.
-        space.collision_slop = 1e-4
+        space.collision_slop = COLLISION_SLOP
         space.collision_bias = 0.0
         # The default tree reports pairs in an order that depends on where the robot has been.
         space.use_spatial_hash(1.0, 100)

@@ -415,6 +415,85 @@ def sample_problem(
     return Problem(scenario, start, goal, final_time)
 
 
+def sample_tables(rng: np.random.Generator, counts: ArrayLike, max_obstacles: int) -> FloatArray:
+    """Discs of many random scenes at once, distributed as :func:`sample_obstacles` places them.
+
+    Args:
+        rng: Source of randomness.
+        counts: ``(k,)`` discs of each scene.
+        max_obstacles: Number ``M`` of rows of each.
+
+    Returns:
+        ``(k, M, 3)`` rows ``(x, y, radius)`` in m, exact in float32, zero beyond the count.
+
+    Raises:
+        ValueError: If so many discs do not fit.
+    """
+    counts = np.asarray(counts)
+    width, height = Scenario.table
+    rows = np.zeros((len(counts), max_obstacles, 3))
+    placed = np.zeros(len(counts), dtype=np.int64)
+    for _ in range(10_000):
+        open_ = np.flatnonzero(placed < counts)
+        if not len(open_):
+            return _float32_exact(rows)
+        radius = rng.uniform(0.1, 0.2, len(open_))
+        x = rng.uniform(0.5, width - 0.5, len(open_))
+        y = rng.uniform(radius, height - radius)
+        others = rows[open_]
+        gaps = np.hypot(x[:, None] - others[..., 0], y[:, None] - others[..., 1])
+        free = ((others[..., 2] == 0.0) | (gaps > radius[:, None] + others[..., 2])).all(axis=1)
+        chosen = open_[free]
+        rows[chosen, placed[chosen]] = np.column_stack([x, y, radius])[free]
+        placed[chosen] += 1
+    raise ValueError(f"Could not place {counts.max()} obstacles on the table; ask for fewer.")
+
+
+def sample_states(
+    rng: np.random.Generator, scenario: Scenario, rows: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Starts and goals of many problems at once, distributed as in :func:`sample_problem`.
+
+    Args:
+        rng: Source of randomness.
+        scenario: Gives robot, table and keep-out factor.
+        rows: ``(k, M, 3)`` discs at rest; radius zero is padding.
+
+    Returns:
+        Start and goal states ``(k, 6)``.
+
+    Raises:
+        ValueError: If the obstacles leave no room.
+    """
+    radius, (width, _) = scenario.robot.radius, scenario.table
+    low, high = (limit[1] for limit in scenario.position_limits)
+    keep_out = np.where(
+        rows[..., 2] > 0.0, (rows[..., 2] + radius) * scenario.keep_out_factor, -1.0
+    )
+    states = []
+    for x_low, x_high in ((radius, 0.5 - radius), (width - 0.5 + radius, width - radius)):
+        state = np.zeros((len(rows), 6))
+        open_ = np.arange(len(rows))
+        for _ in range(10_000):
+            if not len(open_):
+                break
+            pose = rng.uniform([x_low, low, -np.pi], [x_high, high, np.pi], (len(open_), 3))
+            state[open_, :3] = _float32_exact(pose)
+            offset = state[open_, None, :2] - rows[open_, :, :2]
+            gaps = np.hypot(offset[..., 0], offset[..., 1])
+            open_ = open_[(gaps <= keep_out[open_]).any(axis=1)]
+        if len(open_):
+            raise ValueError(
+                f"The obstacles leave no free place with x in {(x_low, x_high)} m; use other "
+                "obstacles."
+            )
+        states.append(state)
+    start, goal = states
+    turn = goal[:, 2] - start[:, 2]
+    goal[:, 2] = start[:, 2] + (turn + np.pi) % (2 * np.pi) - np.pi
+    return start, _float32_exact(goal)
+
+
 def _sample_state_at_rest(
     rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float], time: float
 ) -> FloatArray:

@@ -44,17 +44,20 @@ class PulseWidthModulator:
         """Which thruster is on in which sub-step of the next period.
 
         Args:
-            duties: ``(8,)`` in [0, 1].
+            duties: ``(..., 8)`` in [0, 1]; the same batch in every period.
 
         Returns:
-            ``(sub_steps, 8)``; each pulse lies in the middle of the period.
+            ``(..., sub_steps, 8)``; each pulse lies in the middle of the period.
         """
-        wanted = np.clip(duties, 0.0, 1.0) * self.sub_steps + self.carried
+        wanted = np.minimum(np.maximum(duties, 0.0), 1.0) * self.sub_steps + self.carried
         # Rounding first strips the float noise that could tip an on-time over.
-        on = np.clip(np.floor(np.round(wanted, 9) + 0.5), 0, self.sub_steps).astype(int)
-        on[on < self.min_sub_steps] = 0
+        on = np.floor(np.rint(wanted * 1e9) * 1e-9 + 0.5)
+        on = np.minimum(np.maximum(on, 0.0), self.sub_steps)
+        if self.min_sub_steps > 1:
+            on = np.where(on < self.min_sub_steps, 0.0, on)
         most = max(self.min_sub_steps, 1)
-        self.carried = np.where(np.asarray(duties) > 0.0, np.clip(wanted - on, -1.0, most), 0.0)
+        left = np.minimum(np.maximum(wanted - on, -1.0), most)
+        self.carried = np.where(np.asarray(duties) > 0.0, left, 0.0)
         first = (self.sub_steps - on) // 2
         index = np.arange(self.sub_steps)[:, None]
-        return (index >= first) & (index < first + on)
+        return (index >= first[..., None, :]) & (index < (first + on)[..., None, :])
