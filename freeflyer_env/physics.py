@@ -236,9 +236,29 @@ class World:
         if way > self._room:
             self._room = self._clearance()
         if way > self._room:
-            return False
+            return self._is_clear(duration)
         self._room -= way
         return True
+
+    def _is_clear(self, duration: float) -> bool:
+        """Whether the straight way of so many seconds leads past everything, at rest."""
+        if self._obstacle_speed or not self._balanced:
+            return False
+        (width, height), obstacles = self.scenario.table, self.scenario.obstacles
+        x, y, _, vx, vy, _ = self._free
+        wx, wy, hull = vx * duration, vy * duration, self.plant.robot.radius + _MARGIN
+        if not (hull < x + wx < width - hull and hull < y + wy < height - hull):
+            return False
+        square = wx * wx + wy * wy
+        if square == 0.0:
+            return False
+        for (cx, cy), radius in zip(obstacles.centres.tolist(), obstacles.radii.tolist()):
+            dx, dy = cx - x, cy - y
+            share = min(max((dx * wx + dy * wy) / square, 0.0), 1.0)
+            if math.hypot(dx - share * wx, dy - share * wy) < radius + hull:
+                return False
+        apart, self._room = self._room > _MARGIN, 0.0
+        return apart
 
     def _clearance(self) -> float:
         """Distance in m from the hull to the nearest obstacle or wall."""

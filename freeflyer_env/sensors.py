@@ -56,18 +56,22 @@ def top_view(
         return np.sqrt(dx[..., None, :] ** 2 + dy[..., :, None] ** 2)
 
     def paint(inwards: NDArray[np.float32], color: tuple[int, int, int]) -> None:
-        cover = np.clip(inwards / pixel + 0.5, 0.0, 1.0)[..., None]
-        np.add(picture, cover * (np.array(color, np.float32) - picture), out=picture)
+        where = inwards > -0.5 * pixel
+        cover = np.minimum(inwards[where] / np.float32(pixel) + np.float32(0.5), 1)[:, None]
+        picture[where] += cover * (np.array(color, np.float32) - picture[where])
 
     def nose(pose: NDArray[np.float32]) -> NDArray[np.float32]:
         heading = np.stack([np.cos(pose[..., 2]), np.sin(pose[..., 2])], axis=-1)
         centre = (pose[..., :2] + _NOSE_PLACE * robot_radius * heading).astype(np.float32)
         return _NOSE_RADIUS * robot_radius - distance(centre)
 
+    depth = np.full((*rows.shape[:-2], height, width), -np.inf, dtype=np.float32)
     for index in range(rows.shape[-2]):
         row = rows[..., index, :]
-        radius = np.where(row[..., 2] > 0.0, row[..., 2], -pixel)[..., None, None]
-        paint(radius - distance(row[..., :2]), _OBSTACLE)
+        if (row[..., 2] > 0.0).any():
+            radius = np.where(row[..., 2] > 0.0, row[..., 2], -np.inf)[..., None, None]
+            np.maximum(depth, radius - distance(row[..., :2]), out=depth)
+    paint(depth, _OBSTACLE)
     if goal is not None:
         aim = np.asarray(goal, dtype=np.float32)
         paint(0.5 * _GOAL_WIDTH - np.abs(robot_radius - distance(aim[..., :2])), _GOAL)

@@ -29,6 +29,9 @@ LIDAR_REACH = 5.0
 #: Fastest obstacle in m/s, per axis, that an observation can tell.
 MAX_OBSTACLE_SPEED = 1.0
 
+#: Relative tolerance of the bounds of impulses.
+BOUND_TOLERANCE = 1e-4
+
 #: Longest final time in s for which the observation's bounds hold.
 MAX_FINAL_TIME = 200.0
 
@@ -42,8 +45,8 @@ def action_space(mode: str, robot: Robot, dt: float) -> spaces.Space[Any]:
     # Two thrusters push along each body axis; at 45 degrees to them both pairs add up.
     linear = np.sqrt(8.0) * robot.delta_v_max(dt)
     limit = np.array([linear, linear, 4.0 * robot.lever_arm * robot.delta_v_max(dt)])
-    # One float32 step outwards, so that a plan at the limit is inside.
-    high = np.nextafter(limit.astype(np.float32), np.float32(np.inf))
+    # A little outwards, so that a plan at the limit is inside in spite of a solver's tolerance.
+    high = (limit * (1.0 + BOUND_TOLERANCE)).astype(np.float32)
     return spaces.Box(-high, high, dtype=np.float32)
 
 

@@ -2,54 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from freeflyer_env.control import PulseWidthModulator
+from freeflyer_env.disturbances import Disturbances
 from freeflyer_env.env import ERROR_WEIGHTS, REACH_TOLERANCE, FreeFlyerEnv
-from freeflyer_env.robot import FloatArray, body_from_world
-from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_states, sample_tables
-from freeflyer_env.spaces import require_fit
-from freeflyer_env.vector_contacts import Contacts
+from freeflyer_env.robot import CLUSTER_THRUSTERS, FloatArray
+from freeflyer_env.scenario import Obstacles, sample_states, sample_tables
+from freeflyer_env.vector_contacts import IntArray, Worlds
 
+Observations = dict[str, NDArray[np.float32]]
 BoolArray = NDArray[np.bool_]
 
-_MARGIN = 1e-6  # m between hull and surroundings below which contacts are looked for
+# Random problems drawn at a time, at least: a draw costs about the same for one and for hundreds.
+_BATCH = 512
+
+_MODALITIES = {"state", "robot"}
 
 
-class FreeFlyerVectorEnv(VectorEnv[dict[str, Any], NDArray[Any], NDArray[Any]]):
-    """``num_envs`` times :class:`FreeFlyerEnv` at once, an order of magnitude faster a step.
+class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
+    """``num_envs`` independent copies of :class:`freeflyer_env.env.FreeFlyerEnv`, as one batch.
 
     Made by ``gym.make_vec("FreeFlyer-v0", num_envs=1024,
-    vectorization_mode="vector_entry_point")``. Actions, observations, rewards and endings are those
-    of the scalar environment, with the batch as first axis. Free flight is the same to 1e-9. The
-    contacts follow Chipmunk's rules without Chipmunk: single ones are the same up to rounding;
-    where two happen at once, in a corner, they are solved in a fixed order.
+    vectorization_mode="vector_entry_point")``.
+    Spaces, rewards, endings and physics are those of the single environment, which documents them;
+    with the same problems and actions the states agree to rounding, through contacts too. Not
+    supported, with a ``ValueError``: moving obstacles, disturbances, images and lidar. For these
+    use ``gym.make_vec(..., vectorization_mode="sync")``.
 
-    Infos hold ``is_success`` and ``cost`` ``(n,)``, ``goal_error`` ``(n, 4)``, ``fuel`` ``(n,)``,
-    ``firing_time`` ``(n, 8)`` and ``contacts`` with ``count`` and ``impulse`` ``(n,)`` and ``with``
-    ``(n, M + 1)``, which is true for the obstacles that were touched and, last, for the wall.
+    Observations, and ``info``, have the environments along the first axis and share no memory with
+    the environment. ``info`` is that of the single environment in arrays: ``is_success``
+    ``(num_envs,)``, ``goal_error`` ``(num_envs, 4)`` (m, rad, m/s, rad/s), ``cost``, ``fuel``,
+    ``firing_time`` ``(num_envs, 8)`` in s, and ``contacts`` with ``count`` and ``impulse`` in N s
+    ``(num_envs,)`` and ``with`` ``(num_envs, M + 1)``, true for the obstacles that were touched
+    and, last, for a wall. Each has its mask ``_name``.
+
+    Random problems have the distribution of :func:`freeflyer_env.sample_problem` but are drawn in
+    batches, from one generator: the same seed and number of environments give the same problems,
+    others than the single environment's.
 
     Args:
         num_envs: Number of environments.
-        autoreset_mode: What happens when an episode ends: the next step starts a new one
-            (``NEXT_STEP``), the same step does, with ``final_obs`` and ``final_info`` in the infos
-            (``SAME_STEP``), or the caller resets with ``options={"reset_mask": mask}``
-            (``DISABLED``).
-        **arguments: Those of :class:`FreeFlyerEnv`, but for disturbances, moving obstacles, images
-            and lidar, for which ``vectorization_mode="sync"`` is the way.
+        autoreset_mode: What happens to environments whose episode is over. ``NEXT_STEP``: the next
+            step resets them, whatever the action, with reward zero. ``SAME_STEP``: they are reset
+            at once; ``info["final_obs"]`` (an observation for each, None for others) and
+            ``info["final_info"]`` tell how they ended. ``DISABLED``: call ``reset`` with
+            ``options={"reset_mask": ...}``.
+        **arguments: Of :class:`freeflyer_env.env.FreeFlyerEnv`. ``render_mode`` may be
+            ``"rgb_array"``: a picture of each environment.
 
     Raises:
-        ValueError: If an argument is out of range or is not for the vector form.
+        ValueError: If an argument is out of range or not supported.
     """
 
-    metadata = {  # noqa: RUF012
+    metadata: dict[str, Any] = {  # noqa: RUF012
         "render_modes": ["rgb_array"],
         "render_fps": 10,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
@@ -59,347 +73,432 @@ class FreeFlyerVectorEnv(VectorEnv[dict[str, Any], NDArray[Any], NDArray[Any]]):
         self,
         num_envs: int = 1,
         *,
-        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         **arguments: Any,
     ) -> None:
         if num_envs < 1:
             raise ValueError(f"num_envs must be at least 1, got {num_envs}.")
-        # Checks the arguments, and says what they mean.
-        self._one = one = FreeFlyerEnv(**arguments)
-        for name, given in (
-            ("disturbances", one.disturbances.any_at_all),
-            ("moving obstacles", one.moving_obstacles),
-            (f"observation={one.modalities}", not {"state", "robot"} >= set(one.modalities)),
-            ("render_mode='human'", one.render_mode == "human"),
-        ):
-            if given:
-                raise ValueError(
-                    f"The vector form has no {name}: use gym.make_vec('FreeFlyer-v0', ..., "
-                    "vectorization_mode='sync')."
-                )
+        # Checks the arguments, and knows what follows from them.
+        self._single = single = FreeFlyerEnv(**arguments)
+        _require_support(single)
+        self.num_envs, self.render_mode = num_envs, single.render_mode
         self.autoreset_mode = AutoresetMode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self.autoreset_mode}
-        self.num_envs, self.render_mode = num_envs, one.render_mode
-        self.single_action_space = one.action_space
-        self.single_observation_space = one.observation_space
-        self.action_space = batch_space(one.action_space, num_envs)
-        self.observation_space = batch_space(one.observation_space, num_envs)
-        self._robot, self._dt = one.robot, one.control_dt
-        self._base = one.base_scenario
-        self._modulator = PulseWidthModulator(one.sub_steps)
-        m = one.max_obstacles
-        self._contacts = Contacts(
-            num_envs, m, self._robot, self._base.table, one.restitution, one.friction
+        self.single_observation_space = single.observation_space
+        self.single_action_space = single.action_space
+        self.observation_space = batch_space(self.single_observation_space, num_envs)
+        self.action_space = batch_space(self.single_action_space, num_envs)
+        self._worlds = Worlds(
+            num_envs,
+            single.base_scenario,
+            single.max_obstacles,
+            single.restitution,
+            single.friction,
+            single.contacts,
         )
-        self._state = np.zeros((num_envs, 6))
-        self._goal = np.zeros((num_envs, 6))
-        self._rows = np.zeros((num_envs, m, 3))
-        self._final_time = np.zeros(num_envs)
+        box = single.limits["state"]
+        assert isinstance(box, gym.spaces.Box)
+        self._low, self._high = (side.astype(np.float64)[:, None] for side in (box.low, box.high))
+        self._modulator = PulseWidthModulator(single.sub_steps)
+        self._modulator.carried = np.zeros((num_envs, 8))
+        self._pool: list[FloatArray] = []
+        self._used = 0
+        self._starts, self._goals = np.zeros((num_envs, 6)), np.zeros((num_envs, 6))
+        self._discs = np.zeros((num_envs, single.max_obstacles, 3))
+        self._final_times = np.zeros(num_envs)
         self._steps = np.zeros(num_envs, dtype=np.int64)
-        self._n_steps = np.zeros(num_envs, dtype=np.int64)
-        self._cost, self._firing_time = np.zeros(num_envs), np.zeros((num_envs, 8))
-        self._potential = np.zeros(num_envs)
-        self._done = np.zeros(num_envs, dtype=bool)
-        self._duties = np.zeros((num_envs, 8))
-        self._is_reset = False
-        limits: Any = one.limits["state"]
-        self._low, self._high = limits.low, limits.high
+        self._last_steps = np.zeros(num_envs, dtype=np.int64)
+        self._costs, self._firing_times = np.zeros(num_envs), np.zeros((8, num_envs))
+        self._duties = np.zeros((8, num_envs))
+        self._potentials = np.zeros(num_envs)
+        # Never reset; over.
+        self._idle, self._over = np.ones(num_envs, dtype=bool), np.zeros(num_envs, dtype=bool)
 
     @property
     def states(self) -> FloatArray:
-        """True states ``(num_envs, 6)``, float64, a fresh array."""
-        return self._state.copy()
+        """States ``(num_envs, 6)`` as in the single environment, float64, a fresh array."""
+        return np.ascontiguousarray(self._worlds.state.T)
+
+    @property
+    def goals(self) -> FloatArray:
+        """Goal states ``(num_envs, 6)``, float64, a fresh array."""
+        return self._goals.copy()
 
     def reset(
         self,
         *,
-        seed: int | Sequence[int | None] | None = None,
+        seed: int | Sequence[int] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts new episodes.
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Starts episodes.
 
         Args:
-            seed: One for the batch, or several, which together seed it.
-            options: ``{"problems": [...]}``: one ``Problem`` or mapping for each environment that
-                is reset; ``{"reset_mask": (num_envs,) bool}``: which are; all if left out.
+            seed: Seeds the random problems of the whole batch; a sequence of ``num_envs`` integers
+                will do too, and is one seed as a whole.
+            options: ``{"problems": [...]}`` sets the problems, one for each environment that is
+                reset: each a ``Problem`` or a mapping, as for the single environment.
+                ``{"problem": ...}`` is the same one for all. ``{"reset_mask": ...}``, bool
+                ``(num_envs,)``, leaves the other environments as they are.
+
+        Returns:
+            Observations and infos of all environments; masks in infos tell which were reset.
 
         Raises:
-            ValueError: If a problem or an option is invalid.
+            ValueError: If the seed, an option or a problem is invalid.
         """
-        if seed is not None and not isinstance(seed, int | np.integer):
-            self._np_random = np.random.default_rng([int(item or 0) for item in seed])
-        else:
-            super().reset(seed=seed)
         options = options or {}
-        if unknown := sorted(set(options) - {"problems", "reset_mask"}):
+        if unknown := sorted(set(options) - {"problems", "problem", "reset_mask"}):
             raise ValueError(
-                f"reset() knows only the options 'problems' and 'reset_mask', got {unknown}."
+                f"reset() knows the options 'problems', 'problem' and 'reset_mask', got {unknown}."
             )
-        mask = np.ones(self.num_envs, dtype=bool)
-        if "reset_mask" in options:
-            mask = np.asarray(options["reset_mask"])
-            if mask.shape != (self.num_envs,) or mask.dtype != bool:
-                raise ValueError(
-                    f"reset_mask must be ({self.num_envs},) bool, got {mask.shape} {mask.dtype}."
-                )
-            if not (self._is_reset or mask.all()):
-                raise gym.error.ResetNeeded("Reset all environments once before some of them.")
-        self._is_reset = True
-        self._start(np.flatnonzero(mask), options.get("problems"))
-        return self._observation(), self._info(self._errors())
+        mask = self._checked_mask(options.get("reset_mask"))
+        which = np.flatnonzero(mask)
+        given = options.get("problems")
+        if given is None and options.get("problem") is not None:
+            given = [options["problem"]] * which.size
+        problems = None if given is None else self._given_problems(given, which.size)
+        self._seed(seed)
+        self._start(which, *(problems or self._draw(which.size)))
+        return self._observations(), self._infos(self._errors(), mask)
 
     def step(
         self, actions: NDArray[Any]
-    ) -> tuple[dict[str, Any], FloatArray, BoolArray, BoolArray, dict[str, Any]]:
-        """Applies actions ``(num_envs, ...)`` for one control step."""
-        if not self._is_reset:
+    ) -> tuple[Observations, FloatArray, BoolArray, BoolArray, dict[str, Any]]:
+        """Applies ``(num_envs, ...)`` actions for one control step.
+
+        Returns:
+            Observations, rewards (float64), terminated, truncated and infos, of all environments.
+
+        Raises:
+            ValueError: If the actions have the wrong shape or are not finite.
+            gymnasium.error.ResetNeeded: Before the first reset; without autoreset, if an episode is
+                over.
+        """
+        if self._idle.any():
             raise gym.error.ResetNeeded("Call reset() before step().")
+        if self.autoreset_mode == AutoresetMode.DISABLED and self._over.any():
+            raise gym.error.ResetNeeded(
+                f"The episodes of environments {np.flatnonzero(self._over).tolist()} are over: "
+                "call reset(options={'reset_mask': ...}) first."
+            )
         actions = np.asarray(actions)
         if actions.shape != self.action_space.shape or not np.isfinite(actions).all():
             raise ValueError(
-                f"Actions of mode {self._one.action_mode!r} must be {self.action_space.shape} "
+                f"Actions of mode {self._single.action_mode!r} must be {self.action_space.shape} "
                 f"finite numbers, got shape {actions.shape}."
             )
-        over = self._done
-        if over.any():
-            if self.autoreset_mode is AutoresetMode.DISABLED:
-                raise gym.error.ResetNeeded(
-                    "Some episodes are over: reset them with options={'reset_mask': mask}."
-                )
-            # Those start anew in this step; whatever the batch does to them is undone.
-            actions = np.where(over[:, None], 0, actions)
-        one = self._one
-        effort = self._act(actions.astype(np.float64))
-        self._cost += effort
+        efforts = self._act(actions.T.astype(np.float64))
+        self._costs += efforts
         self._steps += 1
-        error = self._errors()
-        if over.any():
-            self._start(np.flatnonzero(over), None)
-            error = self._errors()
-        info = self._info(error)
-        at_end = self._steps >= self._n_steps
-        success = info["is_success"] & (at_end | one.terminate_early)
-        crashed = (self._contacts.count > 0) & one.terminate_on_contact
-        terminated = (success | crashed) & ~over
-        truncated = (at_end | self._off_table()) & ~terminated & ~over
-        reward = one.success_reward * (success & ~over) - np.where(over, 0.0, effort)
-        if one.reward == "dense":
-            potential = -error @ ERROR_WEIGHTS
-            reward += np.where(over, 0.0, potential - self._potential)
-            self._potential = potential
-        self._done = terminated | truncated
-        observation = self._observation()
-        if self.autoreset_mode is AutoresetMode.SAME_STEP and self._done.any():
-            observation, info = self._restart(observation, info)
-        return observation, reward, terminated, truncated, info
+        renewed = self._over.copy()
+        if renewed.any():
+            which = np.flatnonzero(renewed)
+            self._start(which, *self._draw(which.size))
+        errors = self._errors()
+        infos = self._infos(errors, np.ones(self.num_envs, dtype=bool))
+        single, worlds = self._single, self._worlds
+        at_end = self._steps >= self._last_steps
+        success = (
+            infos["is_success"].copy() if single.terminate_early else infos["is_success"] & at_end
+        )
+        terminated = success & ~renewed
+        if single.terminate_on_contact:
+            terminated |= (worlds.contact_count > 0) & ~renewed
+        truncated = ((at_end | self._off_table()) & ~terminated) & ~renewed
+        rewards = single.success_reward * success - efforts
+        if single.reward == "dense":
+            before, self._potentials = self._potentials, _potential(errors)
+            rewards += self._potentials - before
+        rewards[renewed] = 0.0
+        self._over = terminated | truncated
+        observations = self._observations()
+        if self.autoreset_mode == AutoresetMode.SAME_STEP and self._over.any():
+            observations, infos = self._start_at_once(observations, infos)
+        return observations, rewards, terminated, truncated, infos
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
-        """One picture ``(H, W, 3)`` uint8 of each environment."""
+        """A picture ``(H, W, 3)`` of each environment; meant for a few environments."""
         if self.render_mode is None:
-            gym.logger.warn("render() needs render_mode='rgb_array'.")
+            gym.logger.warn("render() needs render_mode: make_vec(..., render_mode='rgb_array').")
             return None
+        if self._idle.any():
+            raise gym.error.ResetNeeded("Call reset() before render().")
         from freeflyer_env.rendering import draw_scene
 
         return tuple(
             draw_scene(
-                self._scenario(index),
-                self._state[index, :3],
-                goal=self._goal[index, :3],
-                duties=self._duties[index],
-                time=float(self._steps[index] * self._dt),
+                replace(self._single.base_scenario, obstacles=Obstacles.from_rows(self._discs[i])),
+                self._worlds.state[:3, i],
+                start=self._starts[i, :3],
+                goal=self._goals[i, :3],
+                duties=self._duties[:, i],
+                time=self._steps[i] * self._single.control_dt,
             )
-            for index in range(self.num_envs)
+            for i in range(self.num_envs)
         )
 
-    # -- episodes --------------------------------------------------------------------------------
+    # -- problems --------------------------------------------------------------------------------
 
-    def _start(self, indices: NDArray[np.intp], problems: Any) -> None:
-        """Starts episodes of the environments ``(k,)`` given."""
-        if problems is None:
-            self._sample(indices)
+    def _seed(self, seed: int | Sequence[int] | None) -> None:
+        if seed is None:
+            return
+        if isinstance(seed, int | np.integer):
+            super().reset(seed=int(seed))
         else:
-            self._pose(indices, problems)
-        self._n_steps[indices] = np.ceil(self._final_time[indices] / self._dt - 1e-6)
-        self._steps[indices], self._cost[indices] = 0, 0.0
-        self._firing_time[indices], self._duties[indices] = 0.0, 0.0
-        self._done[indices] = False
-        if np.ndim(self._modulator.carried) == 2:
-            self._modulator.carried[indices] = 0.0
-        self._contacts.start(indices, self._rows[indices])
-        difference = self._state[indices] - self._goal[indices]
-        self._potential[indices] = -_errors(difference) @ ERROR_WEIGHTS
+            if len(seed) != self.num_envs:
+                raise ValueError(f"Seeds must be {self.num_envs} integers, got {len(seed)}.")
+            self.np_random = np.random.default_rng([int(item) for item in seed])
+        self._pool, self._used = [], 0
 
-    def _sample(self, indices: NDArray[np.intp]) -> None:
-        rng, one, k = self.np_random, self._one, len(indices)
-        if one.fixed_scenario is not None:
-            table = one.fixed_scenario.obstacles.rows()
-            rows = np.zeros((k, one.max_obstacles, 3))
-            rows[:, : len(table)] = table
-        else:
-            counts = rng.integers(one.n_obstacles[0], one.n_obstacles[1] + 1, k)
-            rows = sample_tables(rng, counts, one.max_obstacles)
-        self._rows[indices] = rows
-        start, goal = sample_states(rng, self._base, rows)
-        self._state[indices], self._goal[indices] = start, goal
-        self._final_time[indices] = one.final_time
+    def _checked_mask(self, mask: Any) -> BoolArray:
+        if mask is None:
+            return np.ones(self.num_envs, dtype=bool)
+        if not (
+            isinstance(mask, np.ndarray)
+            and mask.shape == (self.num_envs,)
+            and mask.dtype == np.bool_
+            and mask.any()
+        ):
+            raise ValueError(
+                f"reset_mask must be an array of {self.num_envs} bools, one of them True at least, "
+                f"got {mask!r}."
+            )
+        return mask.copy()
 
-    def _pose(self, indices: NDArray[np.intp], problems: Any) -> None:
-        if len(problems) != len(indices):
-            raise ValueError(f"{len(indices)} problems are needed, got {len(problems)}.")
-        checked = []
-        for given in problems:
-            if not isinstance(given, (Problem, Mapping)):
-                raise ValueError(
-                    f"A problem must be a Problem or a mapping, got {type(given).__name__}."
-                )
-            problem = given if isinstance(given, Problem) else Problem.from_dict(given, self._base)
-            require_fit(problem.require_valid(), self._base, self._one.limits)
-            checked.append(problem)
-        for index, problem in zip(indices, checked):
+    def _given_problems(
+        self, given: Any, count: int
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Checked starts, goals, obstacle rows and final times."""
+        if len(given) != count:
+            raise ValueError(
+                f"problems must be one for each environment that is reset, {count}, "
+                f"got {len(given)}."
+            )
+        if any(item is None for item in given):
+            raise ValueError("problems must be Problems or mappings, got None.")
+        problems = [self._single._make_problem(item) for item in given]
+        discs = np.zeros((count, self._single.max_obstacles, 3))
+        for rows, problem in zip(discs, problems):
             obstacles = problem.scenario.obstacles
-            self._state[index], self._goal[index] = problem.start, problem.goal
-            self._rows[index] = 0.0
-            self._rows[index, : len(obstacles)] = obstacles.rows()
-            self._final_time[index] = problem.final_time
+            rows[: len(obstacles)] = obstacles.rows()
+        return (
+            np.array([problem.start for problem in problems]),
+            np.array([problem.goal for problem in problems]),
+            discs,
+            np.array([problem.final_time for problem in problems]),
+        )
 
-    def _restart(
-        self, observation: dict[str, Any], info: dict[str, Any]
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts anew what is over, and keeps its last observation and info."""
-        done = np.flatnonzero(self._done)
+    def _draw(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Random starts, goals, obstacle rows and final times."""
+        left = len(self._pool[0]) - self._used if self._pool else 0
+        if left < count:
+            fresh = self._sample(max(count - left, _BATCH))
+            kept = [part[self._used :] for part in self._pool] or [part[:0] for part in fresh]
+            self._pool = [np.concatenate(parts) for parts in zip(kept, fresh)]
+            self._used = 0
+        first, self._used = self._used, self._used + count
+        starts, goals, discs = (part[first : self._used] for part in self._pool)
+        return starts, goals, discs, np.full(count, self._single.final_time)
+
+    def _sample(self, count: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Random starts, goals and obstacle rows."""
+        rng, single = self.np_random, self._single
+        if single.fixed_scenario is None:
+            least, most = single.n_obstacles
+            discs = sample_tables(rng, rng.integers(least, most + 1, count), single.max_obstacles)
+        else:
+            rows = single.fixed_scenario.obstacles.rows()
+            discs = np.zeros((count, single.max_obstacles, 3))
+            discs[:, : len(rows)] = rows
+        return *sample_states(rng, single.base_scenario, discs), discs
+
+    def _start(
+        self,
+        which: IntArray,
+        starts: FloatArray,
+        goals: FloatArray,
+        discs: FloatArray,
+        final_times: FloatArray,
+    ) -> None:
+        """Starts new episodes in some environments."""
+        self._starts[which], self._goals[which], self._discs[which] = starts, goals, discs
+        self._final_times[which], self._steps[which] = final_times, 0
+        steps = np.ceil(final_times / self._single.control_dt - 1e-6)
+        self._last_steps[which] = steps.astype(np.int64)
+        self._costs[which], self._firing_times[:, which] = 0.0, 0.0
+        self._duties[:, which] = 0.0
+        self._modulator.carried[which] = 0.0
+        self._worlds.place(which, starts, discs)
+        self._idle[which], self._over[which] = False, False
+        self._potentials[which] = _potential(self._errors())[which]
+
+    def _start_at_once(
+        self, observations: Observations, infos: dict[str, Any]
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Starts new episodes where they are over, and tells how the old ones ended."""
+        over = self._over.copy()
+        which = np.flatnonzero(over)
         final = np.full(self.num_envs, None, dtype=object)
-        for index in done:
-            final[index] = {key: value[index].copy() for key, value in observation.items()}
-        mask = self._done.copy()
-        self._start(done, None)
-        fresh = self._info(self._errors())
-        fresh |= {"final_obs": final, "_final_obs": mask}
-        fresh |= {"final_info": _masked(info, mask), "_final_info": mask.copy()}
-        return self._observation(), fresh
+        for i in which:
+            final[i] = {key: value[i].copy() for key, value in observations.items()}
+        final_infos = _masked(infos, over)
+        self._start(which, *self._draw(which.size))
+        infos = self._infos(self._errors(), np.ones(self.num_envs, dtype=bool))
+        infos.update(
+            final_obs=final, _final_obs=over, final_info=final_infos, _final_info=over.copy()
+        )
+        return self._observations(), infos
 
     # -- motion ----------------------------------------------------------------------------------
 
     def _act(self, actions: FloatArray) -> FloatArray:
-        """Applies actions, advances the batch, returns the effort ``(n,)`` in m/s."""
-        robot, one, dt = self._robot, self._one, self._dt
-        self._contacts.clear_log()
-        if one.action_mode == "delta_v":
-            body = body_from_world(self._state[:, 2], actions)
-            excess = robot.reach(body, dt)
-            scale = np.where(excess > 1.0 + REACH_TOLERANCE, excess, 1.0)[:, None]
-            actions, body = actions / scale, body / scale
-            self._duties = robot.allocate(body * (robot.mass / dt))
-            self._firing_time += self._duties * dt
-            self._state[:, 3:] += actions * robot.control_gain
-            self._drift()
-            return np.abs(actions).sum(axis=1)
-        if one.action_mode == "thrusters":
-            pulses = self._modulator.pulses(actions)
+        """Applies actions ``(..., n)``, advances the worlds, returns the efforts in m/s."""
+        if self._single.action_mode == "delta_v":
+            return self._act_impulses(actions)
+        single, robot, n = self._single, self._single.robot, self.num_envs
+        if single.action_mode == "thrusters":
+            pulses = self._modulator.pulses(actions.T).transpose(2, 1, 0)
+            on = np.ascontiguousarray(pulses, dtype=np.float64)
+            self._duties = on.sum(axis=1) / single.sub_steps
         else:
-            on = (actions > 0.5)[:, None, :]
-            pulses = np.broadcast_to(on, (self.num_envs, one.sub_steps, 8))
-        self._thrust(pulses.astype(np.float64) @ robot.wrench_matrix.T)
-        self._duties = pulses.sum(axis=1) / one.sub_steps
-        self._firing_time += self._duties * dt
-        return robot.thrust / robot.mass * dt * self._duties.sum(axis=1)
+            on = (actions > 0.5).astype(np.float64)[:, None]
+            self._duties = on[:, 0]
+        wrenches = (robot.wrench_matrix @ on.reshape(8, -1)).reshape(3, -1, n)
+        self._worlds.advance(single.control_dt, single.sub_steps, wrenches)
+        self._firing_times += single.control_dt * self._duties
+        return robot.thrust / robot.mass * single.control_dt * self._duties.sum(axis=0)
 
-    def _drift(self) -> None:
-        """Drift for a control step: in one go where nothing can be touched."""
-        state, h = self._state, self._dt / self._one.sub_steps
-        way = self._dt * np.hypot(state[:, 3], state[:, 4])
-        near = self._near(way)
-        before = state[near]
-        state[:, :3] += self._dt * state[:, 3:]
-        if len(near):
-            for _ in range(self._one.sub_steps):
-                before[:, :3] += h * before[:, 3:]
-                self._contacts.resolve(near, before)
-            state[near] = before
+    def _act_impulses(self, actions: FloatArray) -> FloatArray:
+        robot, period, state = self._single.robot, self._single.control_dt, self._worlds.state
+        cos, sin = np.cos(state[2]), np.sin(state[2])
+        u_x, u_y, turn = actions
+        x, y = 0.5 * (cos * u_x + sin * u_y), 0.5 * (cos * u_y - sin * u_x)
+        spin = turn * (0.25 / robot.lever_arm)
+        signed = np.stack([y + spin, x - spin, spin - y, -x - spin])
+        limit = robot.delta_v_max(period)
+        excess = (0.5 / limit) * (signed.max(axis=0) - signed.min(axis=0))
+        scale = 1.0 / np.where(excess > 1.0 + REACH_TOLERANCE, excess, 1.0)
+        impulses = actions * scale
+        self._duties = _allocate(signed * (scale / limit))
+        self._firing_times += period * self._duties
+        state[3:] += impulses * robot.control_gain[:, None]
+        self._worlds.advance(period, self._single.sub_steps)
+        return np.abs(impulses).sum(axis=0)
 
-    def _thrust(self, wrenches: FloatArray) -> None:
-        """Motion under body wrenches ``(n, sub_steps, 3)``, one a sub-step."""
-        state, robot, h = self._state, self._robot, self._dt / self._one.sub_steps
-        push = np.abs(wrenches[..., :2]).sum(axis=-1).max(axis=1) / robot.mass
-        near = self._near(self._dt * (np.hypot(state[:, 3], state[:, 4]) + push * self._dt))
-        psi, rate = state[:, 2], state[:, 5]
-        for number in range(self._one.sub_steps):
-            fx, fy, torque = wrenches[:, number].T
-            alpha = torque / robot.inertia
-            middle = psi + 0.5 * h * (rate + 0.25 * h * alpha)
-            cos, sin, gain = np.cos(middle), np.sin(middle), 0.5 * h / robot.mass
-            half = np.column_stack(
-                [gain * (cos * fx - sin * fy), gain * (sin * fx + cos * fy), 0.5 * h * alpha]
-            )
-            state[:, 3:] += half
-            state[:, :3] += h * state[:, 3:]
-            if len(near):
-                part = state[near]
-                self._contacts.resolve(near, part)
-                state[near] = part
-            state[:, 3:] += half
-
-    def _near(self, way: FloatArray) -> NDArray[np.intp]:
-        """Environments that may touch something on a way of so many m."""
-        if not self._one.contacts:
-            return np.empty(0, dtype=np.intp)
-        return self._contacts.within(self._state, way + _MARGIN)
+    def _off_table(self) -> BoolArray:
+        """Where the centre has left the table, as it can without contacts."""
+        if self._single.contacts:
+            return np.zeros(self.num_envs, dtype=bool)
+        (x, y), (width, height) = self._worlds.state[:2], self._worlds.table
+        return (x < 0.0) | (x > width) | (y < 0.0) | (y > height)
 
     # -- what is told ----------------------------------------------------------------------------
 
-    def _observation(self) -> dict[str, Any]:
-        left = np.maximum(self._final_time - self._steps * self._dt, 0.0)
-        values = {
-            "state": np.clip(self._state.astype(np.float32), self._low, self._high),
-            "goal": self._goal.astype(np.float32),
-            "obstacles": self._rows.astype(np.float32),
-            "time_to_go": left[:, None].astype(np.float32),
-        }
-        return {key: values[key] for key in self._one.observation_space}
-
-    def _info(self, error: FloatArray) -> dict[str, Any]:
-        firing_time, contacts = self._firing_time.copy(), self._contacts
-        told = {
-            "is_success": (error <= self._one.goal_tolerance).all(axis=1),
-            "goal_error": error,
-            "cost": self._cost.copy(),
-            "fuel": self._robot.thrust * firing_time.sum(axis=1),
-            "firing_time": firing_time,
-        }
-        touched = {
-            "count": contacts.count.copy(),
-            "impulse": contacts.impulse.copy(),
-            "with": contacts.touched.copy(),
-        }
-        everyone = np.ones(self.num_envs, dtype=bool)
-        return _masked({**told, "contacts": _masked(touched, everyone)}, everyone)
-
     def _errors(self) -> FloatArray:
-        return _errors(self._state - self._goal)
-
-    def _off_table(self) -> BoolArray:
-        if self._one.contacts:
-            return np.zeros(self.num_envs, dtype=bool)
-        position = self._state[:, :2]
-        return ((position < 0.0) | (position > self._base.table)).any(axis=1)
-
-    def _scenario(self, index: int) -> Scenario:
-        return Scenario(
-            Obstacles.from_rows(self._rows[index]),
-            self._robot,
-            self._base.table,
-            self._base.dt,
-            self._base.keep_out_factor,
+        """``(4, n)`` errors to the goals in m, rad, m/s and rad/s."""
+        x, y, psi, v_x, v_y, rate = self._worlds.state - self._goals.T
+        return np.stack(
+            [
+                np.sqrt(x * x + y * y),
+                np.abs((psi + np.pi) % (2.0 * np.pi) - np.pi),
+                np.sqrt(v_x * v_x + v_y * v_y),
+                np.abs(rate),
+            ]
         )
 
+    def _observations(self) -> Observations:
+        left = self._final_times - self._steps * self._single.control_dt
+        parts = {
+            "state": np.clip(self._worlds.state, self._low, self._high).T,
+            "goal": self._goals,
+            "obstacles": self._discs,
+            "time_to_go": np.maximum(left, 0.0)[:, None],
+        }
+        return {
+            key: parts[key].astype(np.float32, order="C") for key in self._single.observation_space
+        }
 
-def _errors(difference: FloatArray) -> FloatArray:
-    """Errors ``(n, 4)`` in position, heading, speed and rate of state differences ``(n, 6)``."""
-    x, y, psi, v_x, v_y, omega = difference.T
-    turn = np.abs((psi + np.pi) % (2.0 * np.pi) - np.pi)
-    return np.column_stack([np.hypot(x, y), turn, np.hypot(v_x, v_y), np.abs(omega)])
+    def _infos(self, errors: FloatArray, mask: BoolArray) -> dict[str, Any]:
+        """Infos of all environments, with copies of ``mask``."""
+        tolerance = np.array(self._single.goal_tolerance)[:, None]
+        worlds = self._worlds
+        contacts = {
+            "count": worlds.contact_count.copy(),
+            "impulse": worlds.contact_impulse.copy(),
+            "with": worlds.touched.copy(),
+        }
+        infos = {
+            "is_success": (errors <= tolerance).all(axis=0),
+            "goal_error": np.ascontiguousarray(errors.T),
+            "cost": self._costs.copy(),
+            "fuel": self._single.robot.thrust * self._firing_times.sum(axis=0),
+            "firing_time": np.ascontiguousarray(self._firing_times.T),
+        }
+        return {
+            **_with_masks(infos, mask),
+            "contacts": _with_masks(contacts, mask),
+            "_contacts": mask.copy(),
+        }
 
 
-def _masked(values: dict[str, Any], mask: BoolArray) -> dict[str, Any]:
-    """With Gymnasium's ``_key`` masks, which say whose values are meant."""
-    plain = {key: value for key, value in values.items() if not key.startswith("_")}
-    return {**plain, **{f"_{key}": mask.copy() for key in plain}}
+def _allocate(signed: FloatArray) -> FloatArray:
+    """Duties ``(8, n)`` from cluster thrusts ``(4, n)``, as :meth:`Robot.allocate` gives them."""
+    a, b, c, d = signed
+    (low_1, high_1), (low_2, high_2) = (
+        (np.minimum(p, q), np.maximum(p, q)) for p, q in ((a, b), (c, d))
+    )
+    first, fourth = np.minimum(low_1, low_2), np.maximum(high_1, high_2)
+    inner = np.maximum(low_1, low_2), np.minimum(high_1, high_2)
+    second, third = np.minimum(*inner), np.maximum(*inner)
+    shift = np.maximum(np.minimum(0.0, third), second)
+    low, high = fourth - 1.0, first + 1.0
+    shift = np.where(low > high, 0.5 * (low + high), np.maximum(np.minimum(shift, high), low))
+    clusters = signed - shift
+    clusters[2:] *= -1.0
+    clusters /= np.maximum(np.abs(clusters).max(axis=0), 1.0)
+    duties = np.empty((8, signed.shape[1]))
+    for value, (forward, backward) in zip(clusters, CLUSTER_THRUSTERS):
+        np.maximum(value, 0.0, out=duties[forward])
+        np.maximum(-value, 0.0, out=duties[backward])
+    return duties
+
+
+def _potential(errors: FloatArray) -> FloatArray:
+    """Potential ``(n,)`` of the dense reward, of errors ``(4, n)``."""
+    return -(np.array(ERROR_WEIGHTS) @ errors)
+
+
+def _with_masks(infos: dict[str, Any], mask: BoolArray) -> dict[str, Any]:
+    """Infos, each followed by a copy of the mask that says which environments have it."""
+    return {
+        name: value
+        for key, part in infos.items()
+        for name, value in ((key, part), (f"_{key}", mask.copy()))
+    }
+
+
+def _masked(infos: dict[str, Any], mask: BoolArray) -> dict[str, Any]:
+    """The same infos with all masks replaced by copies of another one."""
+    masked: dict[str, Any] = {}
+    for key, value in infos.items():
+        if isinstance(value, dict):
+            masked[key] = _masked(value, mask)
+        else:
+            masked[key] = mask.copy() if key.startswith("_") else value
+    return masked
+
+
+def _require_support(single: FreeFlyerEnv) -> None:
+    """Raises a ``ValueError`` for what there is in the single environment only."""
+    wants = {
+        "moving obstacles": single.moving_obstacles,
+        "disturbances": single.disturbances != Disturbances(),
+        "images or lidar": not set(single.modalities) <= _MODALITIES,
+        "a window": single.render_mode not in (None, "rgb_array"),
+    }
+    for name, wanted in wants.items():
+        if wanted:
+            raise ValueError(
+                f"FreeFlyerVectorEnv does not support {name}: use "
+                "gym.make_vec(..., vectorization_mode='sync')."
+            )

@@ -21,11 +21,12 @@ _FAR = 10.0
 class FlatObservation(gym.ObservationWrapper, RecordConstructorArgs):
     """One float32 vector of order one, relative to the robot, that a network can learn from.
 
-    It holds what there is to go and how fast the robot is, in the robot's frame:
-    ``(x, y)`` to the goal in m, sine and cosine of the turn to it, the velocity relative to the
-    goal's in 0.1 m/s, the rate relative to the goal's in 0.3 rad/s, the time left in 40 s, and for
-    each row of ``obstacles`` where its centre is in m, its radius in m, and 1 for an obstacle or 0
-    for padding; then ranges of the lidar in m. Values are cut off at 10.
+    It holds what there is to go and how fast the robot is, in the frame in which actions push: the
+    global one for ``delta_v``, the robot's for thrusters. These are ``(x, y)`` to the goal in m,
+    sine and cosine of the turn to it, the velocity relative to the goal's in 0.1 m/s, the rate
+    relative to the goal's in 0.3 rad/s, the time left in 40 s, and for each row of ``obstacles``
+    where its centre is in m, its radius in m, and 1 for an obstacle or 0 for padding; then ranges
+    of the lidar in m. Values are cut off at 10.
 
     Args:
         env: ``FreeFlyer-v0`` with the modality ``"state"`` or ``"robot"``, with or without
@@ -47,24 +48,26 @@ class FlatObservation(gym.ObservationWrapper, RecordConstructorArgs):
         size = 8 + 4 * boxes["obstacles"].shape[0] if "obstacles" in boxes else 8
         size += boxes["lidar"].shape[0] if "lidar" in boxes else 0
         self.observation_space = spaces.Box(-_FAR, _FAR, (size,), np.float32)
+        base: Any = env.unwrapped
+        self._turns = base.action_mode != "delta_v"
 
     def observation(self, observation: dict[str, NDArray[Any]]) -> NDArray[np.float32]:
         """The vector; see the class."""
         state = observation["state"].astype(np.float64)
         error = observation["goal"] - state
-        cos, sin = np.cos(state[2]), np.sin(state[2])
-        into_body = np.array([[cos, sin], [-sin, cos]])
+        cos, sin = (np.cos(state[2]), np.sin(state[2])) if self._turns else (1.0, 0.0)
+        into_frame = np.array([[cos, sin], [-sin, cos]])
         parts: list[Any] = [
-            into_body @ error[:2] / _LENGTH,
+            into_frame @ error[:2] / _LENGTH,
             [np.sin(error[2]), np.cos(error[2])],
-            -into_body @ error[3:5] / _SPEED,
+            -into_frame @ error[3:5] / _SPEED,
             [-error[5] / _RATE],
             observation["time_to_go"] / _TIME,
         ]
         if "obstacles" in observation:
             rows = observation["obstacles"].astype(np.float64)
             mask = obstacle_mask(rows)[:, None]
-            centres = (rows[:, :2] - state[:2]) @ into_body.T
+            centres = (rows[:, :2] - state[:2]) @ into_frame.T
             table = np.hstack([centres / _LENGTH, rows[:, 2:3] / _LENGTH, mask])
             parts.append((table * mask).ravel())
         if "lidar" in observation:

@@ -32,10 +32,14 @@ def test_a_flat_observation_is_relative_to_the_robot():
         [1.0, 1.0, np.pi / 2, 0.05, 0.0, 0.1],
         [1.0, 2.0, np.pi / 2, 0, 0, 0],
     )
-    env = FlatObservation(make(scenario=problem.scenario, max_obstacles=2))
-    vector, _ = env.reset(options={"problem": problem})
-    expected = [1, 0, 0, 1, 0, -0.5, 0.1 / 0.3, 1, 0.5, 0, 0.2, 1, 0, 0, 0, 0]
-    np.testing.assert_allclose(vector, expected, atol=1e-5)
+    rest, padding = [0.1 / 0.3, 1], [0, 0, 0, 0]
+    for mode, expected in (
+        ("thrusters", [1, 0, 0, 1, 0, -0.5, *rest, 0.5, 0, 0.2, 1, *padding]),
+        ("delta_v", [0, 1, 0, 1, 0.5, 0, *rest, 0, 0.5, 0.2, 1, *padding]),
+    ):
+        env = FlatObservation(make(action_mode=mode, scenario=problem.scenario, max_obstacles=2))
+        vector, _ = env.reset(options={"problem": problem})
+        np.testing.assert_allclose(vector, expected, atol=1e-5)
 
 
 def test_an_image_does_not_go_into_a_vector():
