@@ -362,7 +362,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         """Applies an action for one control step."""
         world = self._require_world()
         action = np.asarray(action)
-        if action.shape != self._action_shape or not all(map(math.isfinite, action.tolist())):
+        if action.shape != self._action_shape or not math.isfinite(sum(action.tolist())):
             raise ValueError(
                 f"An action of mode {self.action_mode!r} must be {self._action_shape} finite "
                 f"numbers, got {action.tolist()}."

@@ -48,7 +48,7 @@ class ContactLog:
 
     def to_info(self) -> dict[str, Any]:
         """Plain values for an environment's ``info``."""
-        touched = sorted(self.bodies, key=str)
+        touched = sorted(self.bodies, key=str) if self.bodies else []
         return {"count": self.count, "impulse": self.impulse, "with": touched}
 
 
@@ -210,7 +210,7 @@ class World:
     def take_contacts(self) -> ContactLog:
         """The contacts since the last call."""
         log = self.contacts
-        if log.count or log.impulse:
+        if log.bodies:
             self.contacts = ContactLog()
             return log
         return _NO_CONTACTS

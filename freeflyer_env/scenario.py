@@ -498,13 +498,13 @@ def _sample_state_at_rest(
     rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float], time: float
 ) -> FloatArray:
     low, high = (limit[1] for limit in scenario.position_limits)
-    centres = scenario.obstacles.centres_at(time)
-    keep_out = scenario.keep_out_radii
+    centres = scenario.obstacles.centres_at(time).tolist()
+    keep_out = scenario.keep_out_radii.tolist()
     for _ in range(10_000):
         pose = [rng.uniform(*x_range), rng.uniform(low, high), rng.uniform(-np.pi, np.pi)]
         state = _float32_exact(np.array([*pose, 0.0, 0.0, 0.0]))
-        gaps = np.linalg.norm(state[:2] - centres, axis=1)
-        if (gaps > keep_out).all():
+        x, y = state[:2].tolist()
+        if all(math.hypot(x - cx, y - cy) > gap for (cx, cy), gap in zip(centres, keep_out)):
             return state
     raise ValueError(
         f"The obstacles leave no free place with x in {x_range} m; use other obstacles."

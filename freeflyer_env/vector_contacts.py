@@ -113,6 +113,7 @@ class Worlds:
         h = duration / sub_steps
         near = self._near(duration, wrenches_body is not None)
         if wrenches_body is None:
+            near = self._ahead(near, duration)
             times = h * np.arange(1, sub_steps + 1)[:, None]
             path = self.state[:2, None, near] + times * self.state[3:5, None, near]
             final = self.state.copy()
@@ -145,6 +146,18 @@ class Worlds:
         self._room[unsure] = (apart - self.reach[unsure]).min(axis=1)
         self._room -= way
         return unsure[(self._room[unsure] < 0.0) | self.engaged[unsure]]
+
+    def _ahead(self, worlds: IntArray, duration: float) -> IntArray:
+        """Those of some worlds in which the straight way of so many seconds meets something."""
+        way = duration * self.state[3:5, worlds]
+        dx, dy = offsets(self.centres[:, worlds], self.state[:2, worlds])
+        # A wall is met along its normal alone.
+        wx, wy = (part[:, None] * (offset != 0.0) for part, offset in zip(way, (dx, dy)))
+        share = (dx * wx + dy * wy) / np.maximum(wx * wx + wy * wy, 1e-300)
+        share = np.minimum(np.maximum(share, 0.0), 1.0)
+        square = (dx - share * wx) ** 2 + (dy - share * wy) ** 2
+        meets = (square < (self.reach[worlds] + _MARGIN) ** 2).any(axis=1)
+        return worlds[meets | self.engaged[worlds]]
 
     def _powered(
         self, h: float, sub_steps: int, wrenches_body: FloatArray, near: IntArray
@@ -360,7 +373,14 @@ class _Contacts:
         vy = vy - (ny * warm_n + nx * warm_t).sum(axis=0) / mass
         rate = rate - lever * warm_t.sum(axis=0)
         push_x, push_y, push_sum = np.zeros_like(vx), np.zeros_like(vx), np.zeros_like(depths)
-        for i in list(range(len(surfaces))) * _ITERATIONS:
+        before = None
+        for number in range(len(surfaces) * _ITERATIONS):
+            i = number % len(surfaces)
+            if i == 0:
+                now = np.stack([push_x, push_y, vx, vy, rate])
+                if before is not None and np.array_equal(now, before):
+                    break
+                before = now
             a, b = nx[i], ny[i]
             new = np.maximum(push_sum[i] + wanted_push[i] + push_x * a + push_y * b, 0.0)
             change, push_sum[i] = new - push_sum[i], new
