@@ -1,9 +1,9 @@
 """Speed of the environment: ``python -m benchmarks.env [--out FILE]``.
 
 Everything is measured in turns in one run, several rounds, and reported as the median; ratios are
-of the same round. All of it runs on one thread, and what counts is its processor time, so that other
-work on the machine does little harm. ``bare pymunk`` is the loop that no environment on pymunk can do without: change
-the velocity, take the sub-steps, read the state.
+of the same round. All of it runs on one thread, and what counts is its processor time, so that
+other work on the machine does little harm. ``bare pymunk`` is the loop that no environment on
+pymunk can do without: change the velocity, take the sub-steps, read the state.
 """
 
 from __future__ import annotations

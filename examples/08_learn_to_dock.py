@@ -24,7 +24,7 @@ SETTINGS = {
     "ppo": (PPO, 8, {"n_steps": 512, "batch_size": 512, "gamma": 0.99, "gae_lambda": 0.95,
                      "ent_coef": 0.0, "learning_rate": 5e-4, "n_epochs": 10,
                      "policy_kwargs": {"log_std_init": -0.5}}),
-    "sac": (SAC, 1, {"batch_size": 256, "gamma": 0.98, "learning_rate": 1e-3, "train_freq": 4,
+    "sac": (SAC, 1, {"batch_size": 256, "gamma": 0.98, "learning_rate": 5e-4, "train_freq": 4,
                      "gradient_steps": 2, "learning_starts": 2000, "buffer_size": 200_000,
                      "policy_kwargs": {"net_arch": [128, 128]}}),
 }  # fmt: skip

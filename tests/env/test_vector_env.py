@@ -339,5 +339,3 @@ def test_bad_calls():
     with pytest.raises(ValueError, match="Seeds must be 2"):
         env.reset(seed=[1, 2, 3])
     np.testing.assert_array_equal(env.step(np.zeros((2, 3)))[1], 0.0)
-
-
