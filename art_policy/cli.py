@@ -219,34 +219,44 @@ def _download(options: argparse.Namespace) -> None:
 
 
 def _info(options: argparse.Namespace) -> None:
-    from art_policy.model import ART, shipped_models
     from freeflyer_datasets import list_recipes
-    from freeflyer_datasets.describe import describe, describe_text, list_local
+    from freeflyer_datasets.describe import describe, describe_text, find_local, list_local
 
-    name, models = options.name, shipped_models()
-    data: dict[str, Any]
-    if name and re.search(r"-v\d+$", name) and not Path(name).exists():
-        data = describe(name)
-        print_result(options, data, describe_text(data))
-        return
+    name = options.name
     if name is None:
         import freeflyer_env
+        from art_policy.model import shipped_models
 
-        data = {
+        data: dict[str, Any] = {
             "version": freeflyer_env.__version__,
-            "models": models,
+            "models": shipped_models(),
             "datasets": list_local(),
             "recipes": list_recipes(),
             "scenes": list(freeflyer_env.SCENES),
         }
+        lines = (f"{key}: {', '.join(value) or 'none'}" for key, value in list(data.items())[1:])
+        print_result(options, data, "\n".join([f"version: {data['version']}", *lines]))
+    elif find_local(name):
+        data = describe(name)
+        print_result(options, data, describe_text(data))
     else:
-        model = ART.from_pretrained(name)
-        data = {
-            "model": name,
-            "parameters": model.num_parameters,
-            "config": model.config.to_dict(),
-        }
-    print_result(options, data, "\n".join(f"{key}: {value}" for key, value in data.items()))
+        data = _model_info(name)
+        print_result(options, data, "\n".join(f"{key}: {value}" for key, value in data.items()))
+
+
+def _model_info(name: str) -> dict[str, Any]:
+    from art_policy.model import ART, shipped_models
+    from freeflyer_datasets.describe import unknown_text
+
+    shipped = shipped_models()
+    # A folder is a model, and what cannot be a dataset's id may be one on the hub.
+    on_hub = name.count("/") == 1 and not re.search(r"-v\d+$", name)
+    if name not in shipped and not Path(name).is_dir():
+        message = unknown_text(name, shipped)
+        if not on_hub or "Did you mean" in message:
+            raise ValueError(message)
+    model = ART.from_pretrained(name)
+    return {"model": name, "parameters": model.num_parameters, "config": model.config.to_dict()}
 
 
 # -- options -------------------------------------------------------------------------------------

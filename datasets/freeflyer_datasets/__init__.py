@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 # Not lazily: a submodule's name would hide the function of the same name.
+from freeflyer_datasets.describe import describe
 from freeflyer_datasets.generate import GenerationReport, generate
 from freeflyer_datasets.recipe import Recipe, list_recipes, load_recipe
 from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
@@ -23,6 +24,7 @@ __all__ = [
     "PackedDataset",
     "Recipe",
     "build",
+    "describe",
     "generate",
     "list_recipes",
     "list_samples",

@@ -3,161 +3,66 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from importlib import metadata
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+import freeflyer_env
+from freeflyer_datasets.pictures import HISTOGRAMS, PLATE
 from freeflyer_datasets.recipe import Recipe
-from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP, Shard
+from freeflyer_datasets.summary import Statistics, share
 
 #: Smallest ``C_REL`` of each class of difficulty (paper, Fig. 3).
 C_REL_CLASSES = (0, 5, 10, 15, 20)
 
+_MANY_TIMES = 6  # final times, beyond which the range is said
+
+# Of each picture: what stands for it where it cannot be seen, and its caption.
 _CAPTIONS = {
-    "histograms.png": "Costs, iterations, C_REL",
-    "trajectories.png": "Sixteen problems with their trajectories",
+    HISTOGRAMS: (
+        "Histograms of costs, iterations, C_REL and cost ratios",
+        """Histograms of (a) the costs of REL and of the cheapest optimum, (b) SCP iterations,
+(c) `C_REL`, (d) the ratio of the two costs.""",
+    ),
+    PLATE: (
+        "Scenes with the relaxed trajectory and all optima",
+        """The first problems, not selected: a circle marks the start, a square the goal, a tick the
+heading. REL ignores the keep-out zones, which the robot's centre must not enter.""",
+    ),
 }
-
-
-@dataclass(frozen=True, eq=False)
-class Statistics:
-    """What the card tells of a dataset.
-
-    Attributes:
-        n_problems: Problems, failed ones included.
-        n_failed: Problems without a trajectory.
-        n_steps: Steps of all trajectories.
-        c_rel: ``(P,)`` nodes of REL inside a keep-out zone, of the problems with trajectories.
-        rel_cost: ``(P,)`` cost of REL in m/s.
-        best_cost: ``(P,)`` cost of the cheapest optimum in m/s; NaN where none was found.
-        n_optima: ``(P,)`` number of optima kept.
-        rel_iterations: ``(P,)`` subproblems solved for REL.
-        scp_iterations: ``(number of optima,)`` subproblems solved for each optimum.
-        violation: Largest violation of a constraint of any trajectory.
-    """
-
-    n_problems: int
-    n_failed: int
-    n_steps: int
-    c_rel: NDArray[np.int32]
-    rel_cost: NDArray[np.float64]
-    best_cost: NDArray[np.float64]
-    n_optima: NDArray[np.int64]
-    rel_iterations: NDArray[np.int32]
-    scp_iterations: NDArray[np.int32]
-    violation: float
-
-    @property
-    def n_trajectories(self) -> int:
-        """Number of episodes."""
-        return len(self.rel_cost) + len(self.scp_iterations)
-
-    def summary(self) -> dict[str, Any]:
-        """Plain numbers, for a dataset's metadata; shares with their 95 % interval."""
-        solved = self.solved
-        return {
-            "problems": self.n_problems,
-            "failed": self.n_failed,
-            "episodes": {"REL": len(self.rel_cost), "SCP": len(self.scp_iterations)},
-            "steps": self.n_steps,
-            "rel_feasible": share(self.c_rel == 0),
-            "with_optimum": share(solved),
-            "rel_cost": quantiles(self.rel_cost),
-            "best_cost": quantiles(self.best_cost[solved]),
-            "best_over_rel": quantiles(self.best_cost[solved] / self.rel_cost[solved]),
-            "c_rel": quantiles(self.c_rel),
-            "rel_iterations": quantiles(self.rel_iterations),
-            "scp_iterations": quantiles(self.scp_iterations),
-            "largest_violation": self.violation,
-        }
-
-    @property
-    def solved(self) -> NDArray[np.bool_]:
-        """``(P,)`` whether an optimum was found."""
-        return np.isfinite(self.best_cost)
-
-    @classmethod
-    def of_shards(cls, shards: Iterable[Shard]) -> Statistics:
-        """Statistics of the shards of one dataset."""
-        parts = [_shard_columns(shard) for shard in shards]
-        columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-        return cls(
-            n_problems=int(columns.pop("n_problems").sum()),
-            n_failed=int(columns.pop("n_failed").sum()),
-            n_steps=int(columns.pop("n_steps").sum()),
-            violation=float(columns.pop("violation").max()),
-            **columns,
-        )
-
-
-def _shard_columns(shard: Shard) -> dict[str, np.ndarray]:
-    is_rel, is_best = shard.label == LABEL_REL, (shard.label == LABEL_SCP) & (shard.rank == 0)
-    kept = shard.problem[is_rel]
-    best = np.full(shard.n_problems, np.nan)
-    best[shard.problem[is_best]] = shard.cost[is_best]
-    optima = np.bincount(shard.problem[~is_rel], minlength=shard.n_problems)
-    return {
-        "n_problems": np.array([shard.n_problems]),
-        "n_failed": np.array([shard.n_problems - len(kept)]),
-        "n_steps": np.array([len(shard.controls)]),
-        "c_rel": shard.c_rel[kept],
-        "rel_cost": shard.rel_cost[kept],
-        "best_cost": best[kept],
-        "n_optima": optima[kept],
-        "rel_iterations": shard.iterations[is_rel],
-        "scp_iterations": shard.iterations[~is_rel],
-        "violation": np.array([shard.violation.max(initial=0.0)]),
-    }
-
-
-def wilson_interval(n_successes: int, n: int, z: float = 1.96) -> tuple[float, float]:
-    """Wilson's interval of a proportion; 95 % for ``z = 1.96``, (0, 1) without observations."""
-    if n == 0:
-        return 0.0, 1.0
-    p, extra = n_successes / n, z * z / n
-    middle = (p + extra / 2) / (1 + extra)
-    half = z / (1 + extra) * float(np.sqrt(p * (1 - p) / n + extra / (4 * n)))
-    return max(middle - half, 0.0), min(middle + half, 1.0)
-
-
-def share(mask: NDArray[np.bool_]) -> list[float]:
-    """``[share, lower, upper]`` of what is true, with the 95 % interval."""
-    low, high = wilson_interval(int(mask.sum()), len(mask))
-    return [float(mask.mean()) if len(mask) else float("nan"), low, high]
-
-
-def quantiles(values: NDArray[Any]) -> list[float]:
-    """``[5 %, 50 %, 95 %, mean]``; empty without values."""
-    if not len(values):
-        return []
-    return [*np.quantile(values, [0.05, 0.5, 0.95]).tolist(), float(np.mean(values))]
+# They decide the bytes of a dataset, besides this package and Python.
+_PACKAGES = ("numpy", "piqp", "gymnasium", "minari")
 
 
 def dataset_card(
     recipe: Recipe,
     statistics: Statistics,
-    version: str,
+    versions: Mapping[str, str],
     n_bytes: int,
     pictures: Sequence[str] = (),
 ) -> str:
     """The card as Markdown, with the front matter of the Hugging Face hub.
 
     Args:
-        recipe: How the dataset was made.
+        recipe: How the dataset was made; the card shows the number of problems that were made.
         statistics: What is in it.
-        version: Version of ``freeflyer-gym`` that made it.
+        versions: Those of the packages that exported it, as :func:`package_versions` gives them.
         n_bytes: Size of the data.
-        pictures: Files beside the card to show.
+        pictures: Files beside the card to show, as :func:`.draw_pictures` names them.
     """
     s, name = statistics, recipe.id.rsplit("/", 1)[-1]
-    shown = "\n\n".join(f"![{_CAPTIONS.get(file, file)}]({file})" for file in pictures)
+    shown = ""
+    for file in pictures:
+        instead, caption = _CAPTIONS[file]
+        shown += f"\n![{instead}]({file})\n\n{caption}\n"
+    exported = ", ".join(f"{package} {number}" for package, number in versions.items())
     return f"""---
 license: mit
 viewer: false
+task_categories: [reinforcement-learning, robotics]
 tags: [minari, offline-rl, trajectory-optimization, spacecraft]
 size_categories: [{_size_category(s.n_trajectories)}]
 ---
@@ -175,18 +80,17 @@ import minari
 dataset = minari.load_dataset("{recipe.id}")
 env = dataset.recover_environment()
 ```
-
 {shown}
-
 ## Contents
 
 {_contents(recipe, s, n_bytes)}
 
 ## Feasibility
 
-Shares with their 95 % interval (Wilson).
+Shares with their 95 % interval (Wilson). SCP trajectories are feasible, every one of them: others
+are not kept.
 
-{_feasibility(s)}
+{_feasibility(recipe, s)}
 
 ## Difficulty
 
@@ -204,8 +108,7 @@ Split by the attribute `problem_index`, never by episode.
 
 ## How it was made
 
-With freeflyer-gym {version} from this recipe, which makes it again
-(`freeflyer generate {name}.toml`):
+From this recipe, which makes it again (`freeflyer generate {name}.toml`):
 
 ```toml
 {recipe_toml(recipe, s.n_problems)}
@@ -215,7 +118,7 @@ SCP was started from {_starts(recipe)}.
 Kept is {_kept(recipe)} of each problem.
 Every trajectory was checked against the constraints by code that the solver does not share; the
 largest violation, with float32 actions, is {s.violation:.1e}.
-Exported with {_versions()}.
+Exported with {exported}.
 
 ## Licence and citation
 
@@ -223,14 +126,14 @@ MIT. Please cite the software, and the paper whose method and protocol this foll
 
 ```bibtex
 @software{{freeflyer_gym,
-  title   = {{FreeFlyer / ART: learned warm starts for spacecraft trajectory optimisation}},
+  title   = {{{{FreeFlyer / ART}}: learned warm starts for spacecraft trajectory optimisation}},
   author  = {{{{The FreeFlyer developers}}}},
-  version = {{{version}}},
+  version = {{{versions["freeflyer-gym"]}}},
 }}
 
 @misc{{celestini_art,
-  title  = {{Generalizable Spacecraft Trajectory Generation via Multimodal Learning with
-            Transformers}},
+  title  = {{{{Generalizable Spacecraft Trajectory Generation via Multimodal Learning with
+            Transformers}}}},
   author = {{Celestini, Davide and Afsharrad, Amirhossein and Gammelli, Daniele and
             Guffanti, Tommaso and Zardini, Gioele and Lall, Sanjay and Capello, Elisa and
             D'Amico, Simone and Pavone, Marco}},
@@ -240,27 +143,43 @@ MIT. Please cite the software, and the paper whose method and protocol this foll
 
 
 def recipe_toml(recipe: Recipe, n_problems: int) -> str:
-    """The recipe as TOML, with the number of problems that were made."""
-    fields = {**recipe.to_dict(), "n_problems": n_problems}
-    times = list(recipe.final_times)
-    if len(times) > 6 and np.allclose(np.diff(times), 0.5):
-        fields["final_times"] = {"range": [times[0], times[-1]]}
-    # Strings, numbers and lists of them look the same in TOML and in JSON.
-    lines = [
-        f"{key} = {json.dumps(value)}"
-        if not isinstance(value, dict)
-        else f"{key} = {{ range = {json.dumps(value['range'])} }}"
-        for key, value in fields.items()
-    ]
+    """The recipe as TOML, with the number of problems that were made.
+
+    :meth:`Recipe.from_dict` of the parsed text is the recipe with that number.
+    """
+    lines = []
+    for key, value in {**recipe.to_dict(), "n_problems": n_problems}.items():
+        # Numbers, strings and lists of them look the same in TOML, but for one character.
+        text = json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        if key == "final_times" and len(value) > _MANY_TIMES:
+            ends = [value[0], value[-1]]
+            short = Recipe.from_dict({**recipe.to_dict(), "final_times": {"range": ends}})
+            if short == recipe:
+                text = f"{{ range = {json.dumps(ends)} }}"
+        lines.append(f"{key} = {text}")
     return "\n".join(lines)
 
 
+def final_times_text(times: Sequence[float]) -> str:
+    """Final times in s: all of them, or the range of many."""
+    if len(times) > _MANY_TIMES:
+        return f"{min(times):g} to {max(times):g} ({len(times)} values)"
+    return ", ".join(f"{time:g}" for time in times)
+
+
+def package_versions() -> dict[str, str]:
+    """Versions of this package, of Python (minor), and of those packages that are installed."""
+    found = {
+        "freeflyer-gym": freeflyer_env.__version__,
+        "Python": "{}.{}".format(*sys.version_info),
+    }
+    for package in _PACKAGES:
+        with suppress(metadata.PackageNotFoundError):
+            found[package] = metadata.version(package)
+    return found
+
+
 def _contents(recipe: Recipe, s: Statistics, n_bytes: int) -> str:
-    times = recipe.final_times
-    if len(times) > 6:
-        final_times = f"{min(times):g} to {max(times):g} ({len(times)} values)"
-    else:
-        final_times = ", ".join(f"{time:g}" for time in times)
     solved = s.solved
     rows = [
         ("problems", f"{s.n_problems:,}"),
@@ -268,7 +187,7 @@ def _contents(recipe: Recipe, s: Statistics, n_bytes: int) -> str:
         ("episodes", f"{s.n_trajectories:,} (REL {len(s.rel_cost):,}, SCP {s.n_optima.sum():,})"),
         ("steps", f"{s.n_steps:,}"),
         ("scenes", "random" if recipe.scenes == "random" else ", ".join(recipe.scenes)),
-        ("final times in s", final_times),
+        ("final times in s", final_times_text(recipe.final_times)),
         ("size in MB", f"{n_bytes / 1e6:,.1f}"),
         ("size of an episode in kB", f"{n_bytes / max(s.n_trajectories, 1) / 1e3:.1f}"),
         ("optima per problem", f"{_mean(s.n_optima)}"),
@@ -292,38 +211,29 @@ def _difficulty(s: Statistics) -> str:
     return _table(("C_REL", "problems", "with an optimum", "best cost / REL cost"), rows)
 
 
-def _feasibility(s: Statistics) -> str:
+def _feasibility(recipe: Recipe, s: Statistics) -> str:
+    # With more starts the shards do not tell which of them led to the optimum, when several did.
+    alone = ", SCP started from REL alone" if recipe.n_starts == 1 else ""
+    counts = [
+        ("REL trajectories that happen to be feasible", (s.c_rel == 0).sum(), len(s.c_rel)),
+        ("problems with a REL trajectory", len(s.rel_cost), s.n_problems),
+        (f"problems with an optimum{alone}", s.solved.sum(), s.n_problems),
+    ]
+    if recipe.n_starts > 1 and recipe.optima == "all":
+        counts.append(("problems with several optima", (s.n_optima > 1).sum(), s.n_problems))
     rows = []
-    for what, mask in (
-        ("REL trajectories that keep out of the obstacles", s.c_rel == 0),
-        ("problems with an SCP optimum", s.solved),
-        ("problems with several", s.n_optima > 1),
-    ):
-        part, low, high = share(mask)
-        interval = f"{100 * low:.2f} to {100 * high:.2f} %"
-        rows.append(
-            (what, f"{int(mask.sum()):,} of {len(mask):,}", f"{100 * part:.2f} %", interval)
-        )
+    for what, count, n in counts:
+        part, low, high = (100 * value for value in share(count, n) or [np.nan] * 3)
+        rows.append((what, f"{count:,} of {n:,}", f"{part:.2f} %", f"{low:.2f} to {high:.2f} %"))
     return _table(("", "count", "share", "interval"), rows)
 
 
-def _versions() -> str:
-    import platform
-
-    parts = [f"Python {'.'.join(platform.python_version_tuple()[:2])}"]
-    for package in ("numpy", "piqp", "gymnasium", "minari"):
-        try:
-            parts.append(f"{package} {metadata.version(package)}")
-        except metadata.PackageNotFoundError:
-            continue
-    return ", ".join(parts)
-
-
 def _size_category(n_episodes: int) -> str:
-    for power, name in ((3, "n<1K"), (4, "1K<n<10K"), (5, "10K<n<100K"), (6, "100K<n<1M")):
+    names = ("n<1K", "1K<n<10K", "10K<n<100K", "100K<n<1M", "1M<n<10M", "10M<n<100M")
+    for power, name in enumerate(names, start=3):
         if n_episodes < 10**power:
             return name
-    return "1M<n<10M"
+    return "100M<n<1B"
 
 
 def _starts(recipe: Recipe) -> str:

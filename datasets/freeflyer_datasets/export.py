@@ -18,7 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from tqdm import tqdm
 
 import freeflyer_env
-from freeflyer_datasets.card import Statistics, dataset_card
+from freeflyer_datasets.card import dataset_card, package_versions
 from freeflyer_datasets.generate import generate
 from freeflyer_datasets.pictures import draw_pictures
 from freeflyer_datasets.recipe import Recipe, load_recipe
@@ -30,6 +30,7 @@ from freeflyer_datasets.storage import (
     dataset_folder,
     shard_episodes,
 )
+from freeflyer_datasets.summary import Statistics
 
 logger = logging.getLogger(__name__)
 
@@ -43,12 +44,12 @@ class Credits:
 
     Attributes:
         author: Name.
-        author_email: Address, or another way to reach the author.
-        code_permalink: Where the code of this version is.
+        author_email: Address, or another way to reach the author; Minari wants a text.
+        code_permalink: Where the code of this version is: an address, or what pip installs.
     """
 
     author: str = "The FreeFlyer developers"
-    author_email: str = f"through the issues of {_PACKAGE}"
+    author_email: str = f"none; contact the maintainers of {_PACKAGE}"
     code_permalink: str = f"{_PACKAGE}=={freeflyer_env.__version__}"
 
 
@@ -196,7 +197,7 @@ def _write_dataset(
     )
     pictures = draw_pictures(folder, statistics, next(iterate_shards(shards, n_problems)))
     n_bytes = (folder / "data" / "main_data.hdf5").stat().st_size
-    card = dataset_card(recipe, statistics, freeflyer_env.__version__, n_bytes, pictures)
+    card = dataset_card(recipe, statistics, package_versions(), n_bytes, pictures)
     (folder / "README.md").write_text(card, encoding="utf-8")
 
 
@@ -218,6 +219,7 @@ def _metadata(recipe: Recipe, statistics: Statistics, credits: Credits) -> dict[
         "num_episodes_average_score": _N_REFERENCE_EPISODES,
         "recipe": {**recipe.to_dict(), "n_problems": statistics.n_problems},
         "statistics": statistics.summary(),
+        "versions": package_versions(),
         "episode_attributes": EPISODE_ATTRIBUTES,
     }
 
