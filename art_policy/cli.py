@@ -41,7 +41,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return options.run(options) or 0
     except KeyboardInterrupt:
-        print("interrupted; generate and train resume with the same command", file=sys.stderr)
+        print("interrupted; what takes long resumes with the same command", file=sys.stderr)
         return 130
     except (ValueError, OSError, ModuleNotFoundError, GenerationError) as error:
         message = " ".join(str(error).split())
@@ -133,35 +133,44 @@ def _train(options: argparse.Namespace) -> None:
 
 
 def _evaluate(options: argparse.Namespace) -> None:
-    from art_policy.evaluate import (
+    from art_policy.evaluation import (
         evaluate,
         evaluation_problems,
         markdown_table,
         report,
         save_report,
     )
+    from art_policy.evaluation.figures import figures
     from art_policy.model import ART
 
-    ART.from_pretrained(options.model)  # a wrong name is an error before the work begins
+    for model in options.models:
+        ART.from_pretrained(model)  # a wrong name is an error before the work begins
     check_out(options.out, (".json",))
-    problems = evaluation_problems(
-        options.problems, options.scenes, options.final_time, options.seed
-    )
+    partial = Path(f"{options.out}.partial") if options.out else None
     records = evaluate(
-        options.model, problems, options.candidates, options.workers, progress=not options.json
+        options.models,
+        evaluation_problems(options.problems, options.scenes, options.final_time, options.seed),
+        options.candidates,
+        options.starts,
+        options.workers,
+        progress=not options.json,
+        partial=partial,
     )
-    data = report(records, options.model)
-    if options.out:
+    data = report(records, options.models)
+    if partial:
         save_report(data, Path(options.out))
-    summary = {"model": options.model, "groups": data["groups"], "out": options.out}
+        partial.unlink()
+    drawn = [str(path) for path in figures(data, Path(options.figures))] if options.figures else []
+    groups = data["groups"]
+    summary = {"models": options.models, "groups": groups, "out": options.out, "figures": drawn}
     text = "\n\n".join(
         f"{name} ({group_size(group)} problems)\n\n{markdown_table(group)}"
-        for name, group in data["groups"].items()
+        for name, group in groups.items()
     )
     print_result(options, summary, text)
 
 
-def group_size(group: dict[str, dict[str, float]]) -> int:
+def group_size(group: dict[str, dict[str, Any]]) -> int:
     """Number of problems of a group in a report."""
     return int(next(iter(group.values()))["n"])
 
@@ -318,13 +327,17 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--train-config", help="JSON with fields of TrainConfig")
 
     sub = command("evaluate", _evaluate, "Compare warm starts on problems never trained on.")
-    sub.add_argument("model", help="a shipped model's name, a folder, a Hugging Face id")
+    sub.add_argument(
+        "models", nargs="+", metavar="MODEL", help="a shipped model's name, folder, Hugging Face id"
+    )
     sub.add_argument("--problems", type=count, default=300)
     sub.add_argument("--scenes", default="held-out", help="'held-out', 'random' or a scene's name")
     sub.add_argument("--final-time", type=float, nargs="+", default=[40.0], help="in s")
     sub.add_argument("--candidates", type=count, default=4, help="most candidates refined")
+    sub.add_argument("--starts", type=count, default=13, help="starts for the best known solution")
     sub.add_argument("--workers", type=count)
-    sub.add_argument("--out", help="JSON file for the report")
+    sub.add_argument("--out", help="JSON file for the report; with it the evaluation resumes")
+    sub.add_argument("--figures", help="folder for figures")
 
     sub = command("render", _render, "Draw an episode of a dataset.")
     sub.add_argument("dataset", help="Minari id")

@@ -144,6 +144,6 @@ def write_plan(out: str, problem: Any, plan: Any) -> None:
 
 def print_result(options: argparse.Namespace, data: dict[str, Any], text: str) -> None:
     """Prints ``data`` as one JSON object with ``--json``, else ``text``."""
-    from art_policy.evaluate import finite
+    from art_policy.evaluation import finite
 
     print(json.dumps(finite(data), allow_nan=False) if options.json else text)

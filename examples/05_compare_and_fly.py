@@ -15,7 +15,13 @@ from typing import Any
 from art_policy import ART, WarmStartPlanner
 from art_policy.cli import DEFAULT_MODEL
 from art_policy.cli_io import flight_summary, flight_text
-from art_policy.evaluate import evaluate, evaluation_problems, markdown_table, report, save_report
+from art_policy.evaluation import (
+    evaluate,
+    evaluation_problems,
+    markdown_table,
+    report,
+    save_report,
+)
 from art_policy.figures import fly_and_film, plan_and_flight
 from freeflyer_env.planning import solve_rel
 from freeflyer_env.rendering import save_gif

@@ -498,7 +498,8 @@ def _sample_state_at_rest(
     rng: np.random.Generator, scenario: Scenario, x_range: tuple[float, float], time: float
 ) -> FloatArray:
     low, high = (limit[1] for limit in scenario.position_limits)
-    centres = scenario.obstacles.centres_at(time).tolist()
+    obstacles = scenario.obstacles
+    centres = (obstacles.centres_at(time) if obstacles.moving else obstacles.centres).tolist()
     keep_out = scenario.keep_out_radii.tolist()
     for _ in range(10_000):
         pose = [rng.uniform(*x_range), rng.uniform(low, high), rng.uniform(-np.pi, np.pi)]

@@ -86,14 +86,16 @@ def upload(
             folder_path=folder,
             path_in_repo=place.folder,
             # Not the packed form, a cache.
-            allow_patterns=["data/*", _CARD_NAME, MANIFEST_NAME],
-            delete_patterns=["data/*"],
+            allow_patterns=["data/*", "*.png", _CARD_NAME, MANIFEST_NAME],
+            delete_patterns=["data/*", "*.png"],
             commit_message=f"Upload {dataset_id}",
         )
         repository = _Repository.at_head(api, place)
         files = _namespace_files(repository, place, listed=True)
         if place.namespaces and (folder / _CARD_NAME).is_file():
             card = (folder / _CARD_NAME).read_text(encoding="utf-8")
+            # The page lies a folder above the card and its pictures.
+            card = re.sub(r"\]\((\w+\.png)\)", rf"]({place.folder}/\1)", card)
             files[_CARD_NAME] = _page(repository.text(_CARD_NAME), dataset_id, card)
         _publish(repository, files, f"List {dataset_id}")
         return f"{api.endpoint}/datasets/{place.repository}"
@@ -436,7 +438,9 @@ def _files_of(repository: _Repository, place: _Place) -> dict[str, tuple[RepoFil
     return {
         name: (entry, manifest.get(name) or (entry.lfs.sha256 if entry.lfs else None))
         for name, entry in names.items()
-        if name.startswith("data/") or name in (_CARD_NAME, MANIFEST_NAME)
+        if name.startswith("data/")
+        or name in (_CARD_NAME, MANIFEST_NAME)
+        or ("/" not in name and name.endswith(".png"))
     }
 
 

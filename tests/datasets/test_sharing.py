@@ -35,6 +35,7 @@ DATA = "tiny-v0/data/main_data.hdf5"
 FILES = [
     *("tiny-v0/README.md", f"tiny-v0/{MANIFEST_NAME}"),
     *(DATA, "tiny-v0/data/metadata.json"),
+    *("tiny-v0/histograms.png", "tiny-v0/trajectories.png"),
 ]
 
 
@@ -264,7 +265,10 @@ def test_the_card_is_on_the_page_of_the_repository(hub: Hub, source: Path):
     upload(DATASET, remote=REMOTE, progress=False)
     page = hub.files["README.md"].decode()
     assert page.startswith("---\nlicense: mit\n")
-    assert card.split("---\n", 2)[2].strip() in page
+    shown = card.replace("](histograms.png)", "](tiny-v0/histograms.png)")
+    shown = shown.replace("](trajectories.png)", "](tiny-v0/trajectories.png)")
+    assert shown.split("---\n", 2)[2].strip() in page
+    assert shown != card
     edited = page.replace("# freeflyer/tiny-v0", "# old") + "\nBy hand.\n"
     edited += "\n<!-- freeflyer/other-v0 -->\nother\n<!-- end of freeflyer/other-v0 -->\n"
     hub.files["README.md"] = edited.encode()
@@ -522,7 +526,8 @@ def test_a_dataset_without_a_namespace(hub: Hub, source: Path, data_root: Path, 
     upload("tiny-v0", remote=REMOTE, progress=False)
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(data_root))
     assert contents(download("tiny-v0", remote=REMOTE, progress=False)).keys() == {
-        *("README.md", MANIFEST_NAME, "data/main_data.hdf5", "data/metadata.json")
+        *("README.md", MANIFEST_NAME, "data/main_data.hdf5", "data/metadata.json"),
+        *("histograms.png", "trajectories.png"),
     }
 
 
