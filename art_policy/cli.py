@@ -17,7 +17,6 @@ from typing import Any
 
 from art_policy.cli_io import (
     check_out,
-    configure,
     flight_summary,
     flight_text,
     plan_summary,
@@ -27,6 +26,7 @@ from art_policy.cli_io import (
     problem_of,
     write_plan,
 )
+from art_policy.cli_models import evaluate_models, export_model, train_model
 from freeflyer_datasets.generate import ENGINES, GenerationError
 
 DEFAULT_MODEL = "art-scene-random"
@@ -101,78 +101,6 @@ def _generate(options: argparse.Namespace) -> None:
     if options.out:
         text += f" and MINARI_DATASETS_PATH={options.out}"
     print_result(options, {"dataset": dataset, "out": options.out}, text)
-
-
-def _train(options: argparse.Namespace) -> None:
-    from art_policy.layers import ARTConfig
-    from art_policy.train import TrainConfig, train
-    from freeflyer_datasets import PackedDataset
-
-    presets: dict[str, Callable[..., ARTConfig]] = {
-        "multi_hypothesis": ARTConfig,
-        "autoregressive": ARTConfig.paper,
-        "autoregressive_small": ARTConfig.small,
-    }
-    model_config = configure(presets[options.head], "--model-config", options.model_config)
-    length = {"max_minutes": options.minutes, "max_steps": options.steps, "seed": options.seed}
-    config = configure(TrainConfig, "--train-config", options.train_config, **length)
-    check_out(options.out, ())
-    if Path(options.dataset).is_dir():
-        folder = Path(options.dataset)
-        is_packed = (folder / "meta.json").is_file()
-        dataset = PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
-    else:
-        dataset = PackedDataset.from_minari(options.dataset)
-    model = train(dataset, model_config, config, options.out)
-    text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
-    print_result(
-        options,
-        {"out": options.out, "parameters": model.num_parameters, "problems": dataset.n_problems},
-        f"{text} {options.out}",
-    )
-
-
-def _evaluate(options: argparse.Namespace) -> None:
-    from art_policy.evaluation import (
-        evaluate,
-        evaluation_problems,
-        markdown_table,
-        report,
-        save_report,
-    )
-    from art_policy.evaluation.figures import figures
-    from art_policy.model import ART
-
-    for model in options.models:
-        ART.from_pretrained(model)  # a wrong name is an error before the work begins
-    check_out(options.out, (".json",))
-    partial = Path(f"{options.out}.partial") if options.out else None
-    records = evaluate(
-        options.models,
-        evaluation_problems(options.problems, options.scenes, options.final_time, options.seed),
-        options.candidates,
-        options.starts,
-        options.workers,
-        progress=not options.json,
-        partial=partial,
-    )
-    data = report(records, options.models)
-    if partial:
-        save_report(data, Path(options.out))
-        partial.unlink()
-    drawn = [str(path) for path in figures(data, Path(options.figures))] if options.figures else []
-    groups = data["groups"]
-    summary = {"models": options.models, "groups": groups, "out": options.out, "figures": drawn}
-    text = "\n\n".join(
-        f"{name} ({group_size(group)} problems)\n\n{markdown_table(group)}"
-        for name, group in groups.items()
-    )
-    print_result(options, summary, text)
-
-
-def group_size(group: dict[str, dict[str, Any]]) -> int:
-    """Number of problems of a group in a report."""
-    return int(next(iter(group.values()))["n"])
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -316,7 +244,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", help="Minari data root (default: Minari's own)")
     sub.add_argument("--force", action="store_true", help="replace a dataset of the same id")
 
-    sub = command("train", _train, "Train a model on a dataset; resumes.")
+    sub = command("train", train_model, "Train a model on a dataset; resumes.")
     sub.add_argument("dataset", help="Minari id, or a folder of shards or of a packed dataset")
     heads = ("multi_hypothesis", "autoregressive", "autoregressive_small")
     sub.add_argument("--head", choices=heads, default=heads[0])
@@ -326,7 +254,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--model-config", help="JSON with fields of ARTConfig")
     sub.add_argument("--train-config", help="JSON with fields of TrainConfig")
 
-    sub = command("evaluate", _evaluate, "Compare warm starts on problems never trained on.")
+    sub = command("evaluate", evaluate_models, "Compare warm starts on problems never trained on.")
     sub.add_argument(
         "models", nargs="+", metavar="MODEL", help="a shipped model's name, folder, Hugging Face id"
     )
@@ -338,6 +266,11 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--workers", type=count)
     sub.add_argument("--out", help="JSON file for the report; with it the evaluation resumes")
     sub.add_argument("--figures", help="folder for figures")
+
+    sub = command("export", export_model, "Write a model as ONNX, to run without PyTorch.")
+    sub.add_argument("model", help="a multi-hypothesis model")
+    sub.add_argument("--int8", action="store_true", help="weights as 8-bit integers")
+    sub.add_argument("--out", required=True, help=".onnx file")
 
     sub = command("render", _render, "Draw an episode of a dataset.")
     sub.add_argument("dataset", help="Minari id")

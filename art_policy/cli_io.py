@@ -40,10 +40,10 @@ def problem_of(options: argparse.Namespace) -> Any:
 
 def planner_of(options: argparse.Namespace) -> Any:
     """The planner with the model that the options name; ``"rel"`` is none."""
-    from art_policy.model import ART
+    from art_policy.model import load_model
     from art_policy.planner import PlannerConfig, WarmStartPlanner
 
-    model = None if options.model == "rel" else ART.from_pretrained(options.model)
+    model = None if options.model == "rel" else load_model(options.model)
     return WarmStartPlanner(model, PlannerConfig(n_candidates=options.candidates))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from safetensors.torch import load_file, save_file
@@ -14,6 +14,9 @@ from torch import nn
 from art_policy.autoregressive import Autoregressive
 from art_policy.layers import ARTConfig
 from art_policy.multi_hypothesis import MultiHypothesis
+
+if TYPE_CHECKING:
+    from art_policy.deployment import OnnxART
 
 PRETRAINED_DIR = Path(__file__).parent / "pretrained"
 WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
@@ -84,6 +87,20 @@ class ART(nn.Module):
         except RuntimeError as error:
             raise ValueError(f"The weights in {folder} do not fit its config.json.") from error
         return model.to(device).eval()
+
+
+def load_model(name_or_path: str | Path) -> ART | OnnxART:
+    """A model for inference: an exported ``.onnx`` file, or what :meth:`ART.from_pretrained` takes.
+
+    Raises:
+        FileNotFoundError: If there is no such model.
+        ValueError: If the files do not describe a model of this version.
+    """
+    if str(name_or_path).endswith(".onnx"):
+        from art_policy.deployment import OnnxART
+
+        return OnnxART(name_or_path)
+    return ART.from_pretrained(name_or_path)
 
 
 def shipped_models() -> list[str]:

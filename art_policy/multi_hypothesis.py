@@ -118,7 +118,8 @@ class MultiHypothesis(nn.Module):
             Deviations at the knots ``(B, H, n_knots, 3)`` in m, m, rad, and score logits
             ``(B, H)``.
         """
-        batch, n_queries = len(problems), self.config.n_hypotheses
+        # Not len(problems), which would become a constant in an exported model.
+        batch, n_queries = problems.start.shape[0], self.config.n_hypotheses
         tokens = torch.cat(
             [
                 self.query_embedding.expand(batch, -1, -1),
@@ -209,7 +210,8 @@ def _assign(distances: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
 def _padding_mask(problems: ProblemBatch, n_others: int) -> Tensor | None:
     """``(B, 1, 1, L)`` True at real tokens, or None where nothing is padded."""
     present = problems.present
-    if bool(present.all()):
+    # Attention is faster without a mask; an exported model cannot choose.
+    if not torch.compiler.is_exporting() and bool(present.all()):
         return None
     return F.pad(present, (n_others, 0), value=True)[:, None, None, :]
 

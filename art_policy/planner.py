@@ -25,6 +25,7 @@ from freeflyer_env.planning import (
 from freeflyer_env.scenario import Problem
 
 if TYPE_CHECKING:
+    from art_policy.deployment import OnnxART
     from art_policy.model import ART
 
 #: A warm start this deep inside a keep-out disc (m) is not worth refining.
@@ -97,7 +98,7 @@ class WarmStartPlanner:
         config: Settings.
     """
 
-    def __init__(self, model: ART | None, config: PlannerConfig | None = None) -> None:
+    def __init__(self, model: ART | OnnxART | None, config: PlannerConfig | None = None) -> None:
         self.model = model
         self.config = config or PlannerConfig()
 

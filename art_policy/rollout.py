@@ -21,6 +21,7 @@ from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem, Scenario
 
 if TYPE_CHECKING:
+    from art_policy.deployment import OnnxART
     from art_policy.model import ART
 
 
@@ -40,7 +41,7 @@ class Proposal:
 
 
 def propose(
-    model: ART, problem: Problem, n_candidates: int = 1, rel: Trajectory | None = None
+    model: ART | OnnxART, problem: Problem, n_candidates: int = 1, rel: Trajectory | None = None
 ) -> list[Proposal]:
     """Warm starts for one problem, best first.
 
@@ -54,7 +55,7 @@ def propose(
 
 
 def propose_batch(
-    model: ART,
+    model: ART | OnnxART,
     problems: Sequence[Problem],
     n_candidates: int = 1,
     rels: Sequence[Trajectory] | None = None,
@@ -80,7 +81,9 @@ def propose_batch(
 
 
 @torch.inference_mode()
-def _hypotheses(model: ART, problems: Sequence[Problem], n_candidates: int) -> list[list[Proposal]]:
+def _hypotheses(
+    model: ART | OnnxART, problems: Sequence[Problem], n_candidates: int
+) -> list[list[Proposal]]:
     config = model.config
     batch = ProblemBatch.from_problems(problems)
     # In training the goal is to the right; other problems are looked at in a mirror.

@@ -19,6 +19,7 @@ from freeflyer_env.planning.homotopy import homotopy_starts
 from freeflyer_env.scenario import HELD_OUT_SCENES, Problem, Scenario, sample_problem
 
 if TYPE_CHECKING:
+    from art_policy.deployment import OnnxART
     from art_policy.model import ART
 
 #: Root of the seeds of test problems; datasets use their recipes' seeds and a spawn key of length
@@ -121,7 +122,7 @@ def evaluation_problems(
 
 
 def evaluate_problem(
-    models: Mapping[str, ART],
+    models: Mapping[str, ART | OnnxART],
     scene: str,
     index: int,
     problem: Problem,

@@ -16,6 +16,7 @@ from art_policy.evaluation.statistics import finite
 from freeflyer_env.scenario import Problem, Scenario, sample_problem
 
 if TYPE_CHECKING:
+    from art_policy.deployment import OnnxART
     from art_policy.model import ART
 
 Problems = Sequence[tuple[str, int, Problem]]
@@ -132,8 +133,8 @@ def _stamp(model: str | Path) -> str:
     """A hash of a model's weights; its name where they are not here yet."""
     from art_policy.model import PRETRAINED_DIR, WEIGHTS_NAME
 
-    for folder in (Path(model), PRETRAINED_DIR / str(model)):
-        weights = folder / WEIGHTS_NAME
+    folders = (Path(model), PRETRAINED_DIR / str(model))
+    for weights in (Path(model), *(folder / WEIGHTS_NAME for folder in folders)):
         if weights.is_file():
             return hashlib.sha256(weights.read_bytes()).hexdigest()
     return str(model)
@@ -170,11 +171,11 @@ class _one_thread:
 
 
 @functools.lru_cache(maxsize=8)
-def _load(model: str, stamp: str) -> ART:
+def _load(model: str, stamp: str) -> ART | OnnxART:
     """The model, once per process and state of its weights."""
-    from art_policy.model import ART
+    from art_policy.model import load_model
 
-    return ART.from_pretrained(model)
+    return load_model(model)
 
 
 @functools.lru_cache(maxsize=64)

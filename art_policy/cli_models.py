@@ -1,0 +1,96 @@
+"""The commands about models: train, evaluate, export."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from art_policy.cli_io import check_out, configure, print_result
+
+
+def train_model(options: argparse.Namespace) -> None:
+    """Trains a model on a dataset."""
+    from art_policy.layers import ARTConfig
+    from art_policy.train import TrainConfig, train
+    from freeflyer_datasets import PackedDataset
+
+    presets: dict[str, Callable[..., ARTConfig]] = {
+        "multi_hypothesis": ARTConfig,
+        "autoregressive": ARTConfig.paper,
+        "autoregressive_small": ARTConfig.small,
+    }
+    model_config = configure(presets[options.head], "--model-config", options.model_config)
+    length = {"max_minutes": options.minutes, "max_steps": options.steps, "seed": options.seed}
+    config = configure(TrainConfig, "--train-config", options.train_config, **length)
+    check_out(options.out, ())
+    if Path(options.dataset).is_dir():
+        folder = Path(options.dataset)
+        is_packed = (folder / "meta.json").is_file()
+        dataset = PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
+    else:
+        dataset = PackedDataset.from_minari(options.dataset)
+    model = train(dataset, model_config, config, options.out)
+    text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
+    print_result(
+        options,
+        {"out": options.out, "parameters": model.num_parameters, "problems": dataset.n_problems},
+        f"{text} {options.out}",
+    )
+
+
+def evaluate_models(options: argparse.Namespace) -> None:
+    """Compares warm starts on problems never trained on."""
+    from art_policy.evaluation import (
+        evaluate,
+        evaluation_problems,
+        markdown_table,
+        report,
+        save_report,
+    )
+    from art_policy.evaluation.figures import figures
+    from art_policy.model import load_model
+
+    for model in options.models:
+        load_model(model)  # a wrong name is an error before the work begins
+    check_out(options.out, (".json",))
+    partial = Path(f"{options.out}.partial") if options.out else None
+    records = evaluate(
+        options.models,
+        evaluation_problems(options.problems, options.scenes, options.final_time, options.seed),
+        options.candidates,
+        options.starts,
+        options.workers,
+        progress=not options.json,
+        partial=partial,
+    )
+    data = report(records, options.models)
+    if partial:
+        save_report(data, Path(options.out))
+        partial.unlink()
+    drawn = [str(path) for path in figures(data, Path(options.figures))] if options.figures else []
+    groups = data["groups"]
+    summary = {"models": options.models, "groups": groups, "out": options.out, "figures": drawn}
+    text = "\n\n".join(
+        f"{name} ({group_size(group)} problems)\n\n{markdown_table(group)}"
+        for name, group in groups.items()
+    )
+    print_result(options, summary, text)
+
+
+def group_size(group: dict[str, dict[str, Any]]) -> int:
+    """Number of problems of a group in a report."""
+    return int(next(iter(group.values()))["n"])
+
+
+def export_model(options: argparse.Namespace) -> None:
+    """Writes a model as ONNX."""
+    from art_policy.deployment import export_onnx
+    from art_policy.model import ART
+
+    check_out(options.out, (".onnx",))
+    path = export_onnx(ART.from_pretrained(options.model), options.out, options.int8)
+    size = path.stat().st_size / 1e6
+    text = f"wrote {path} ({size:.1f} MB); now: freeflyer evaluate {options.model} {path}"
+    print_result(options, {"out": str(path), "mb": size}, text)
