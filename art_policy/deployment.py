@@ -111,10 +111,12 @@ def _quantise(path: Path) -> None:
     from onnxruntime.quantization.shape_inference import quant_pre_process
 
     prepared = path.with_suffix(".prepared.onnx")
+    logging.disable(logging.WARNING)  # it has no say in what is not quantised
     try:
         quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)
         quantize_dynamic(prepared, path, weight_type=QuantType.QInt8, per_channel=True)
     finally:
+        logging.disable(logging.NOTSET)
         prepared.unlink(missing_ok=True)
 
 

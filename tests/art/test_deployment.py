@@ -74,7 +74,12 @@ def test_what_cannot_be_exported_or_loaded(tmp_path):
         export_onnx(ART(ARTConfig.small(width=32, n_heads=1, n_layers=1)), tmp_path / "m.onnx")
     with pytest.raises(FileNotFoundError, match="There is no file"):
         load_model(tmp_path / "none.onnx")
-    graph = onnx.helper.make_graph([], "empty", [], [])
+    ends = [onnx.helper.make_tensor_value_info(name, 1, [1]) for name in "xy"]
+    node = onnx.helper.make_node("Relu", ["x"], ["y"])
+    graph = onnx.helper.make_graph([node], "other", ends[:1], ends[1:])
     onnx.save(onnx.helper.make_model(graph, ir_version=9), tmp_path / "other.onnx")
     with pytest.raises(ValueError, match="not written by freeflyer export"):
         load_model(tmp_path / "other.onnx")
+    (tmp_path / "no.onnx").write_bytes(b"no")
+    with pytest.raises(ValueError, match="not an ONNX model that runs"):
+        load_model(tmp_path / "no.onnx")
