@@ -17,17 +17,13 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import cached_property
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from freeflyer_datasets.hub import Place, Repository, SharingError, explained, progress_bars
 from freeflyer_datasets.packing import describe_file
 
 if TYPE_CHECKING:
-    from huggingface_hub import HfApi
     from huggingface_hub.hf_api import RepoFile
 
 #: Checksums of the files in ``data``, as ``sha256sum`` writes and checks them.
@@ -37,11 +33,6 @@ _CARD_NAME = "README.md"
 _METADATA_NAME = "data/metadata.json"
 _NAMESPACE_NAME = "namespace_metadata.json"
 _BLOCK_BYTES = 32 * 2**20
-_TIMEOUT = 60.0  # s; by default huggingface_hub waits for ever
-
-
-class SharingError(ValueError):
-    """A dataset was not shared; the message says why, and what to do."""
 
 
 def upload(
@@ -70,15 +61,15 @@ def upload(
     Raises:
         SharingError: If it cannot be pushed. Of the local dataset only ``SHA256SUMS`` changes.
     """
-    with _explained(f"{dataset_id!r} was not uploaded"), _progress_bars(progress):
+    with explained(f"{dataset_id!r} was not uploaded"), progress_bars(progress):
         from huggingface_hub import HfApi
 
-        place = _Place.of(dataset_id, remote)
+        place = Place.of(dataset_id, remote)
         folder = _local_dataset(dataset_id)
         _write_manifest(folder)
         api = HfApi(token=token)
         api.create_repo(place.repository, repo_type="dataset", exist_ok=True)
-        repository = _Repository.at_head(api, place)
+        repository = Repository.at_head(api, place)
         _publish(repository, _namespace_files(repository, place), f"Namespace of {dataset_id}")
         api.upload_folder(
             repo_id=place.repository,
@@ -90,7 +81,7 @@ def upload(
             delete_patterns=["data/*", "*.png"],
             commit_message=f"Upload {dataset_id}",
         )
-        repository = _Repository.at_head(api, place)
+        repository = Repository.at_head(api, place)
         files = _namespace_files(repository, place, listed=True)
         if place.namespaces and (folder / _CARD_NAME).is_file():
             card = (folder / _CARD_NAME).read_text(encoding="utf-8")
@@ -127,19 +118,19 @@ def download(
         SharingError: If it cannot be fetched, is damaged, or a dataset of this id is here and
             ``force`` is not set. A dataset that was here stays then.
     """
-    with _explained(f"{dataset_id!r} was not downloaded"), _progress_bars(progress):
+    with explained(f"{dataset_id!r} was not downloaded"), progress_bars(progress):
         from huggingface_hub import HfApi
 
         from freeflyer_datasets.storage import dataset_folder
 
-        place = _Place.of(dataset_id, remote)
+        place = Place.of(dataset_id, remote)
         target = dataset_folder(dataset_id)
         if target.exists() and not force:
             raise SharingError(
                 f"A dataset {dataset_id!r} is already in {str(target)!r}. Set force=True to "
                 f"replace it, or MINARI_DATASETS_PATH to another folder."
             )
-        repository = _Repository.at_head(HfApi(), place)
+        repository = Repository.at_head(HfApi(), place)
         files = _files_of(repository, place)
         _check_metadata(repository, place)
         temporary = target.with_name(f".{target.name}.download")
@@ -147,176 +138,6 @@ def download(
         _create_namespace(repository, place)
         _install(temporary, target)
         return target
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where a dataset is on the hub.
-
-    Attributes:
-        dataset_id: Its id.
-        repository: ``OWNER/NAME``.
-        folder: Of the dataset in the repository; empty if the id has no namespace.
-        namespaces: ``a`` and ``a/b`` of ``a/b/name-v0``.
-    """
-
-    dataset_id: str
-    repository: str
-    folder: str
-    namespaces: tuple[str, ...]
-
-    @classmethod
-    def of(cls, dataset_id: str, remote: str | None) -> _Place:
-        from minari.dataset.minari_dataset import parse_dataset_id
-        from minari.storage.remotes import DEFAULT_REMOTE
-
-        try:
-            parse_dataset_id(dataset_id)
-        except (ValueError, TypeError):  # TypeError is Minari's for an id without a version.
-            raise SharingError(
-                f"{dataset_id!r} is no dataset id; give one like 'freeflyer/scene-1-v0'."
-            ) from None
-        address = remote or os.environ.get("MINARI_REMOTE") or DEFAULT_REMOTE
-        match = re.fullmatch(r"hf://([\w.-]+)/?", address)
-        if match is None:
-            raise SharingError(
-                f"{address!r} is no remote that can be used here; give remote='hf://OWNER', OWNER "
-                f"being an account of Hugging Face, or set MINARI_REMOTE to it."
-            )
-        parts = PurePosixPath(dataset_id).parts
-        namespaces = tuple("/".join(parts[: end + 1]) for end in range(len(parts) - 1))
-        return cls(dataset_id, f"{match[1]}/{parts[0]}", "/".join(parts[1:]), namespaces)
-
-    def path(self, name: str) -> str:
-        """Path in the repository of a file of the dataset."""
-        return f"{self.folder}/{name}" if self.folder else name
-
-
-@dataclass(frozen=True)
-class _Repository:
-    """A repository at one commit."""
-
-    api: HfApi
-    name: str
-    commit: str
-    files: dict[str, RepoFile]
-
-    @classmethod
-    def at_head(cls, api: HfApi, place: _Place) -> _Repository:
-        from huggingface_hub.hf_api import RepoFile
-
-        commit = api.dataset_info(place.repository, timeout=_TIMEOUT).sha
-        assert commit is not None
-        entries = api.list_repo_tree(
-            place.repository, recursive=True, revision=commit, repo_type="dataset"
-        )
-        files = {entry.path: entry for entry in entries if isinstance(entry, RepoFile)}
-        return cls(api, place.repository, commit, files)
-
-    @cached_property
-    def _file_system(self) -> Any:
-        from huggingface_hub import HfFileSystem
-
-        token, endpoint = self.api.token, self.api.endpoint
-        return HfFileSystem(token=token, endpoint=endpoint, skip_instance_cache=True)
-
-    def open(self, path: str) -> Any:
-        """A file that reads exactly the bytes asked for, each time with a request."""
-        address = f"datasets/{self.name}@{self.commit}/{path}"
-        size = self.files[path].size
-        return self._file_system.open(address, "rb", cache_type="none", size=size)
-
-    def text(self, path: str) -> str | None:
-        """A small file's content, None if there is no such file."""
-        # Not hf_hub_download: Minari edits the files in that cache.
-        if path not in self.files:
-            return None
-        with self.open(path) as file:
-            return bytes(file.read(self.files[path].size)).decode()
-
-
-@contextmanager
-def _explained(what: str) -> Iterator[None]:
-    """Turns every failure into a :class:`SharingError` of one line with a remedy."""
-    try:
-        yield
-    except SharingError:
-        raise
-    except ImportError as error:
-        package = (error.name or str(error)).partition(".")[0]
-        raise SharingError(
-            f"{what}: {package} is missing. pip install 'freeflyer-gym[data]' huggingface-hub"
-        ) from error
-    except Exception as error:
-        if reason := _reason(error):
-            raise SharingError(f"{what}: {reason}") from error
-        raise
-
-
-def _reason(error: Exception) -> str | None:
-    """What failed, by the first error of the chain that tells; None for what should not occur."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if reason := _reason_of_hub(cause):
-            return reason
-        cause = cause.__cause__
-    if isinstance(error, (OSError, ValueError, RuntimeError)):
-        return f"{_first_line(error)}. What is done is kept; put that right and call it again."
-    return None
-
-
-def _reason_of_hub(error: BaseException) -> str | None:
-    # By name: the HTTP library beneath huggingface_hub has changed, and will again.
-    names = {kind.__name__ for kind in type(error).__mro__}
-    status = getattr(getattr(error, "response", None), "status_code", None)
-    if "OfflineModeIsEnabled" in names:
-        return "HF_HUB_OFFLINE is set. Unset it, and call it again."
-    if names & {"TransportError", "TimeoutException", "ConnectionError", "Timeout"}:
-        return (
-            f"Hugging Face cannot be reached ({_first_line(error)}). Check the connection and call "
-            f"it again: it goes on where it stopped."
-        )
-    if "RepositoryNotFoundError" in names:
-        return (
-            "there is no such repository on Hugging Face, or it is private. Check the id and "
-            "remote='hf://OWNER'; if it is private, the token too ('hf auth login' or HF_TOKEN)."
-        )
-    if status == 401:
-        return (
-            "Hugging Face does not accept the token, or there is none. Log in with "
-            "'hf auth login', or set HF_TOKEN."
-        )
-    if status == 403:
-        return (
-            "the token does not permit that. Use one with write access, and an account of yours "
-            "as remote='hf://OWNER' or MINARI_REMOTE."
-        )
-    if status in (409, 412):
-        return "the repository has changed in the meantime. Call it again."
-    if status is not None:
-        return f"Hugging Face says {_first_line(error)!r}. Call it again later: it goes on."
-    return None
-
-
-def _first_line(error: BaseException) -> str:
-    text = getattr(error, "server_message", None) or str(error)
-    lines = text.strip().splitlines()
-    return lines[0].rstrip(".") if lines else type(error).__name__
-
-
-@contextmanager
-def _progress_bars(shown: bool) -> Iterator[None]:
-    """Without the bars of huggingface_hub, unless they are to be shown."""
-    from huggingface_hub import utils
-
-    if shown or utils.are_progress_bars_disabled():
-        yield
-        return
-    utils.disable_progress_bars()
-    try:
-        yield
-    finally:
-        utils.enable_progress_bars()
 
 
 def _local_dataset(dataset_id: str) -> Path:
@@ -354,9 +175,7 @@ def _read_manifest(text: str | None) -> dict[str, str]:
     return {name: checksum for checksum, _, name in (line.partition("  ") for line in lines)}
 
 
-def _namespace_files(
-    repository: _Repository, place: _Place, listed: bool = False
-) -> dict[str, str]:
+def _namespace_files(repository: Repository, place: Place, listed: bool = False) -> dict[str, str]:
     """The files that describe the namespaces, what the hub knows of them being kept."""
     from minari.namespace import get_namespace_metadata, list_local_namespaces
 
@@ -399,7 +218,7 @@ def _page(page: str | None, dataset_id: str, card: str) -> str:
     return f"{before}{section}{after if found else rest}"
 
 
-def _publish(repository: _Repository, files: dict[str, str], message: str) -> None:
+def _publish(repository: Repository, files: dict[str, str], message: str) -> None:
     """Commits those of the files, by path in the repository, that differ from the hub's."""
     from huggingface_hub import CommitOperationAdd
 
@@ -415,7 +234,7 @@ def _publish(repository: _Repository, files: dict[str, str], message: str) -> No
         )
 
 
-def _files_of(repository: _Repository, place: _Place) -> dict[str, tuple[RepoFile, str | None]]:
+def _files_of(repository: Repository, place: Place) -> dict[str, tuple[RepoFile, str | None]]:
     """The dataset's files by name, each with its SHA-256 where that is known."""
     prefix = place.path("")
     names = {
@@ -444,7 +263,7 @@ def _files_of(repository: _Repository, place: _Place) -> dict[str, tuple[RepoFil
     }
 
 
-def _check_metadata(repository: _Repository, place: _Place) -> None:
+def _check_metadata(repository: Repository, place: Place) -> None:
     import minari
 
     metadata = json.loads(repository.text(place.path(_METADATA_NAME)) or "{}")
@@ -457,7 +276,7 @@ def _check_metadata(repository: _Repository, place: _Place) -> None:
 
 
 def _fetch(
-    repository: _Repository,
+    repository: Repository,
     files: dict[str, tuple[RepoFile, str | None]],
     folder: Path,
     target: Path,
@@ -498,7 +317,7 @@ def _fetch(
         )
 
 
-def _fetch_file(repository: _Repository, entry: RepoFile, path: Path, bar: Any) -> None:
+def _fetch_file(repository: Repository, entry: RepoFile, path: Path, bar: Any) -> None:
     # Not hf_hub_download, which starts again with a file of many GB when it is interrupted.
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f"{path.name}.{entry.blob_id[:12]}.part")
@@ -527,7 +346,7 @@ def _is_sound(path: Path, entry: RepoFile, checksum: str | None) -> bool:
     return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest() == entry.blob_id
 
 
-def _create_namespace(repository: _Repository, place: _Place) -> None:
+def _create_namespace(repository: Repository, place: Place) -> None:
     from minari.namespace import create_namespace, list_local_namespaces
 
     if place.namespaces and place.namespaces[-1] not in list_local_namespaces():
