@@ -175,6 +175,8 @@ class World:
             else:
                 self._engage()
                 self._advance(h, sub_steps, None)
+        elif self._has_room(duration, wrenches):
+            self._glide(h, wrenches)
         else:
             for index, wrench in enumerate(wrenches):
                 half = self._half_kick(h, wrench)
@@ -225,18 +227,24 @@ class World:
         self._engaged = False
         self._free, self._time, self._room = list(centre_of_mass), time, room
 
-    def _has_room(self, duration: float) -> bool:
-        """Whether nothing can be touched for so long at the present velocity."""
+    def _has_room(self, duration: float, wrenches: list[list[float]] | None = None) -> bool:
+        """Whether nothing can be touched for so long at the present velocity, or under thrust."""
         if not self._solid:
             return True
         _, _, _, vx, vy, rate = self._free
         way = duration * (math.hypot(vx, vy) + self._obstacle_speed) + _MARGIN
+        if wrenches is not None:
+            if not self._balanced:
+                return False
+            push = max([abs(fx) + abs(fy) for fx, fy, _ in wrenches]) / self.plant.robot.mass
+            ax, ay = self.plant.acceleration
+            way += duration * duration * (push + abs(ax) + abs(ay))
         if not self._balanced:
             way += duration * abs(rate) * math.hypot(*self.plant.com)
         if way > self._room:
             self._room = self._clearance()
         if way > self._room:
-            return self._is_clear(duration)
+            return wrenches is None and self._is_clear(duration)
         self._room -= way
         return True
 
@@ -275,6 +283,25 @@ class World:
         x, y, psi, vx, vy, rate = self._free
         self._free = [x + vx * duration, y + vy * duration, psi + rate * duration, vx, vy, rate]
         self._time += duration
+
+    def _glide(self, h: float, wrenches: list[list[float]]) -> None:
+        """Sub-steps of ``h`` seconds under thrust with nothing near, in plain floats."""
+        x, y, psi, vx, vy, rate = self._free
+        robot, (cx, cy), (ax, ay) = self.plant.robot, self.plant.com, self.plant.acceleration
+        half, inertia = 0.5 * h, robot.inertia
+        gain = half / robot.mass
+        ax, ay = half * ax, half * ay
+        for fx, fy, torque in wrenches:
+            alpha = (torque - (cx * fy - cy * fx)) / inertia
+            middle = psi + half * (rate + 0.5 * half * alpha)
+            cos, sin = math.cos(middle), math.sin(middle)
+            dx, dy = gain * (cos * fx - sin * fy) + ax, gain * (sin * fx + cos * fy) + ay
+            turn = half * alpha
+            vx, vy, rate = vx + dx, vy + dy, rate + turn
+            x, y, psi = x + h * vx, y + h * vy, psi + h * rate
+            vx, vy, rate = vx + dx, vy + dy, rate + turn
+        self._free = [x, y, psi, vx, vy, rate]
+        self._time += h * len(wrenches)
 
     def _kick(self, dx: float, dy: float, turn: float) -> None:
         """Changes the velocity of the centre of mass, and the rate."""
