@@ -9,6 +9,7 @@ as Chipmunk keeps them, so that lasting contacts come out alike too.
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 
 import numpy as np
@@ -288,10 +289,11 @@ class _Contacts:
         self._solve_single(
             velocity, robots[alone], surfaces[alone], normals[:, alone], depths[alone]
         )
-        self._solve(
-            velocity,
-            *_tabulated(robots[several], surfaces[several], normals[:, several], depths[several]),
-        )
+        where = np.flatnonzero(several)
+        for part in np.split(where, np.flatnonzero(np.diff(robots[where])) + 1):
+            self._solve_several(
+                velocity, int(robots[part[0]]), surfaces[part], normals[:, part], depths[part]
+            )
 
     def _solve_single(
         self,
@@ -301,7 +303,7 @@ class _Contacts:
         normals: FloatArray,
         depths: FloatArray,
     ) -> None:
-        """What :meth:`_solve` does where each robot has one contact, in closed form.
+        """What :meth:`_solve_several` does where each robot has one contact, in closed form.
 
         Args:
             velocity: ``(3, k)``, changed.
@@ -338,69 +340,59 @@ class _Contacts:
         self._count[robots] += began
         self._impulse[robots] += np.hypot(sums[0], sums[1])
 
-    def _solve(
+    def _solve_several(
         self,
         velocity: FloatArray,
-        robots: IntArray,
+        robot: int,
         surfaces: IntArray,
         normals: FloatArray,
         depths: FloatArray,
     ) -> None:
-        """Sequential impulses.
+        """Sequential impulses for one robot with several contacts, in plain floats.
 
         Args:
             velocity: ``(3, k)``, changed.
-            robots: ``(q,)`` distinct indices into k.
-            surfaces: ``(c, q)`` which surfaces are touched; -1: none.
-            normals: ``(2, c, q)`` unit vectors from robot to surface; zero: none.
-            depths: ``(c, q)`` distance between hull and surface in m, negative.
+            robot: Index into k.
+            surfaces: ``(c,)`` which surfaces are touched.
+            normals: ``(2, c)`` unit vectors from robot to surface.
+            depths: ``(c,)`` distance between hull and surface in m, negative.
         """
-        robot, friction = self._every.robot, self._every.friction
-        mass, lever = robot.mass, robot.radius / robot.inertia
-        tangent_mass = 1.0 / (1.0 / mass + robot.radius * lever)
-        there = surfaces >= 0
-        age = np.where(there, self._age[robots, surfaces], _FORGOTTEN)
-        normal_sum, tangent_sum = np.where(
-            age <= _PERSISTENCE, self._impulses[:, robots, surfaces], 0.0
-        )
-        (nx, ny), (vx, vy, rate) = normals, velocity[:, robots]
-        bounce = self._every.restitution * (vx * nx + vy * ny)
-        wanted_push = -np.minimum(0.0, depths + COLLISION_SLOP)
+        body, friction = self._every.robot, self._every.friction
+        mass, lever = body.mass, body.radius / body.inertia
+        tangent_mass = 1.0 / (1.0 / mass + body.radius * lever)
+        vx, vy, rate = velocity[:, robot].tolist()
+        ages = self._age[robot, surfaces]
         # A contact that goes on starts from its last impulses; a new one finds what is left of an
         # old one in the sums only.
-        warm_n, warm_t = np.where(age == 1, (normal_sum, tangent_sum), 0.0)
-        vx = vx - (nx * warm_n - ny * warm_t).sum(axis=0) / mass
-        vy = vy - (ny * warm_n + nx * warm_t).sum(axis=0) / mass
-        rate = rate - lever * warm_t.sum(axis=0)
-        push_x, push_y, push_sum = np.zeros_like(vx), np.zeros_like(vx), np.zeros_like(depths)
-        before = None
-        for number in range(len(surfaces) * _ITERATIONS):
-            i = number % len(surfaces)
-            if i == 0:
-                now = np.stack([push_x, push_y, vx, vy, rate])
-                if before is not None and np.array_equal(now, before):
-                    break
-                before = now
-            a, b = nx[i], ny[i]
-            new = np.maximum(push_sum[i] + wanted_push[i] + push_x * a + push_y * b, 0.0)
-            change, push_sum[i] = new - push_sum[i], new
-            push_x, push_y = push_x - a * change, push_y - b * change
-            new = np.maximum(normal_sum[i] + mass * (vx * a + vy * b + bounce[i]), 0.0)
-            change, normal_sum[i] = (new - normal_sum[i]) / mass, new
-            if friction > 0.0:
-                slip = vy * a - vx * b + robot.radius * rate
-                new = np.clip(tangent_sum[i] + tangent_mass * slip, -friction * new, friction * new)
-                across, tangent_sum[i] = new - tangent_sum[i], new
-                rate = rate - lever * across
-                vx, vy = vx + b * across / mass, vy - a * across / mass
-            vx, vy = vx - a * change, vy - b * change
-        velocity[:, robots] = vx, vy, rate
-        self._push[:, robots] = push_x, push_y
-        columns = np.broadcast_to(robots, surfaces.shape)[there]
-        self._impulses[:, columns, surfaces[there]] = normal_sum[there], tangent_sum[there]
-        self._age[columns, surfaces[there]] = 0
-        self._count[robots] += (there & (age > 1)).sum(axis=0)
-        self._impulse[robots] += np.hypot(normal_sum, tangent_sum).sum(axis=0)
+        sums = np.where(ages <= _PERSISTENCE, self._impulses[:, robot, surfaces], 0.0).T.tolist()
+        directions = normals.T.tolist()
+        bounces = [self._every.restitution * (vx * a + vy * b) for a, b in directions]
+        wanted = [max(-depth - COLLISION_SLOP, 0.0) for depth in depths.tolist()]
+        for (a, b), (jn, jt), age in zip(directions, sums, ages.tolist()):
+            if age == 1:
+                vx, vy = vx - (a * jn - b * jt) / mass, vy - (b * jn + a * jt) / mass
+                rate -= lever * jt
+        px, py, pushes = 0.0, 0.0, [0.0] * len(wanted)
+        for _ in range(_ITERATIONS):
+            before = px, py, vx, vy, rate
+            for i, (a, b) in enumerate(directions):
+                new = max(pushes[i] + wanted[i] + px * a + py * b, 0.0)
+                px, py = px - a * (new - pushes[i]), py - b * (new - pushes[i])
+                pushes[i], (jn, jt) = new, sums[i]
+                new = max(jn + mass * (vx * a + vy * b + bounces[i]), 0.0)
+                slip = vy * a - vx * b + body.radius * rate
+                across = min(max(jt + tangent_mass * slip, -friction * new), friction * new)
+                sums[i] = [new, across]
+                along, across = (new - jn) / mass, across - jt
+                rate -= lever * across
+                vx, vy = vx + b * across / mass - a * along, vy - a * across / mass - b * along
+            if before == (px, py, vx, vy, rate):
+                break
+        velocity[:, robot], self._push[:, robot] = (vx, vy, rate), (px, py)
+        self._impulses[:, robot, surfaces] = np.array(sums).T
+        self._age[robot, surfaces] = 0
+        self._count[robot] += (ages > 1).sum()
+        self._impulse[robot] += sum(math.hypot(*pair) for pair in sums)
 
 
 @lru_cache
@@ -436,30 +428,3 @@ def offsets(centres: FloatArray, positions: FloatArray) -> FloatArray:
     towards[1, ..., 0:4:2] = 0.0
     towards[0, ..., 1:4:2] = 0.0
     return towards
-
-
-def _tabulated(
-    rows: IntArray, surfaces: IntArray, normals: FloatArray, depths: FloatArray
-) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
-    """Contacts in one column for each robot, with as many lines as the most contacts of one.
-
-    Args:
-        rows: ``(m,)`` robot of each contact, ascending.
-        surfaces: ``(m,)`` surfaces.
-        normals: ``(2, m)`` normals.
-        depths: ``(m,)`` depths.
-
-    Returns:
-        What :meth:`_Contacts._solve` takes. Empty places have no normal: they do nothing.
-    """
-    robots, first, column = np.unique(rows, return_index=True, return_inverse=True)
-    line = np.arange(rows.size) - first[column]
-    shape = (int(line.max()) + 1, robots.size)
-    all_surfaces, all_normals, all_depths = (
-        np.full(shape, -1),
-        np.zeros((2, *shape)),
-        np.zeros(shape),
-    )
-    all_surfaces[line, column], all_depths[line, column] = surfaces, depths
-    all_normals[:, line, column] = normals
-    return robots, all_surfaces, all_normals, all_depths
