@@ -113,22 +113,18 @@ class Worlds:
         self.touched = np.zeros_like(self.touched)
         h = duration / sub_steps
         near = self._near(duration, wrenches_body is not None)
+        wrenches = None
         if wrenches_body is None:
-            near = self._ahead(near, duration)
-            times = h * np.arange(1, sub_steps + 1)[:, None]
-            path = self.state[:2, None, near] + times * self.state[3:5, None, near]
+            touching = self._ahead(near, duration)
             final = self.state.copy()
             final[:3] += duration * self.state[3:]
         else:
             final, path = self._powered(h, sub_steps, wrenches_body, near)
-        if near.size:
             touching = near[self.engaged[near] | self._overlap(path, near)]
-            if touching.size:
-                wrenches = None
-                if wrenches_body is not None:
-                    shape = (3, sub_steps, self.state.shape[1])
-                    wrenches = np.broadcast_to(wrenches_body, shape)[:, :, touching]
-                final[:, touching] = self._collide(touching, h, sub_steps, wrenches)
+            shape = (3, sub_steps, self.state.shape[1])
+            wrenches = np.broadcast_to(wrenches_body, shape)[:, :, touching]
+        if touching.size:
+            final[:, touching] = self._collide(touching, h, sub_steps, wrenches)
         self.state = final
 
     # -- free flight -----------------------------------------------------------------------------
