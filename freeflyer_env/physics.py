@@ -357,15 +357,20 @@ class World:
         """Steps of ``h`` seconds in pymunk."""
         self._history.append(("_advance", (h, sub_steps, wrenches)))
         self._touched = False
-        for index in range(sub_steps):
-            if wrenches is None:
-                self._step(h)
-            else:
-                half = self._half_kick(h, wrenches[index])
-                self._kick_body(*half)
-                self._step(h)
-                self._kick_body(*half)
         assert self._space is not None
+        if wrenches is not None:
+            for wrench in wrenches:
+                half = self._half_kick(h, wrench)
+                self._kick_body(*half)
+                self._step(h)
+                self._kick_body(*half)
+        elif self._movers:
+            for _ in range(sub_steps):
+                self._step(h)
+        else:
+            for _ in range(sub_steps):
+                self._space.step(h)
+            self._time += sub_steps * h
         self._steps_apart = 0 if self._touched else self._steps_apart + sub_steps
         if self._steps_apart > self._space.collision_persistence:
             self._fly(self._centre_of_mass(), self._time, 0.0)
