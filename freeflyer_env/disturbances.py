@@ -61,14 +61,20 @@ class Disturbances:
         for item in fields(self):
             value = getattr(self, item.name)
             if item.name == "failed_thruster":
-                if value is not None and value not in range(8):
+                whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+                if value is not None and not (whole and 0 <= value < 8):
                     raise ValueError(
                         f"Disturbances.failed_thruster must be None or 0 to 7, got {value!r}."
                     )
             elif item.name == "delay":
-                if not isinstance(value, int | np.integer) or value < 0:
+                whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+                if not whole or value < 0:
                     raise ValueError(f"Disturbances.delay must be an integer >= 0, got {value!r}.")
-            elif not (isinstance(value, float | int) and math.isfinite(value) and value >= 0.0):
+            elif not (
+                isinstance(value, float | int | np.floating | np.integer)
+                and math.isfinite(value)
+                and value >= 0.0
+            ):
                 raise ValueError(
                     f"Disturbances.{item.name} must be a finite number >= 0, got {value!r}."
                 )
@@ -76,6 +82,11 @@ class Disturbances:
             if getattr(self, name) > 0.2:
                 raise ValueError(
                     f"Disturbances.{name} is relative and at most 0.2, got {getattr(self, name)}."
+                )
+        for name, most in (("table_tilt", 0.1), ("com_offset", 0.1), ("min_on_time", 0.1)):
+            if getattr(self, name) > most:
+                raise ValueError(
+                    f"Disturbances.{name} must be at most {most}, got {getattr(self, name)}."
                 )
 
     @classmethod
@@ -112,6 +123,10 @@ class Disturbances:
             return cls()
         if isinstance(given, Disturbances):
             return given
+        if not isinstance(given, str | Mapping):
+            raise ValueError(
+                f"disturbances must be 'testbed', their fields or Disturbances, got {given!r}."
+            )
         if isinstance(given, str):
             if given != "testbed":
                 raise ValueError(f"disturbances must be 'testbed' or their fields, got {given!r}.")

@@ -31,6 +31,8 @@ from freeflyer_env.spaces import (
     obstacle_rows,
     require_choice,
     require_fit,
+    require_integer,
+    require_number,
 )
 
 #: One period of the pulse-width modulation in s (10 Hz), the control step of the thruster modes.
@@ -86,7 +88,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     | 2   | angular impulse per unit mass, `J/m dw`  | -0.002866 | 0.002866 | m^2/s |
 
     `action_mode="thrusters"`: `Box(0, 1, (8,))`, float32, duty of each thruster over the next 0.1
-    s, realised by pulse-width modulation: one pulse, a whole number of sub-steps (10 ms) long. What
+    s, realised by pulse-width modulation: one pulse, a whole number of sub-steps long. What
     rounding leaves over is carried to the next step, so that small duties act on average.
 
     `action_mode="on_off"`: `MultiBinary(8)`, each thruster on or off for the next 0.1 s.
@@ -124,7 +126,9 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     `success_reward` is added.
 
     `reward="dense"` adds by how much the weighted error to the goal fell, 1 per m, 0.2 per rad, 2
-    per m/s and 0.2 per rad/s (potential-based shaping: it does not change which policy is best).
+    per m/s and 0.2 per rad/s: over an episode, the error at the start minus that at the end.
+
+    Costs are those of the commands at nominal thrust, whatever disturbs the thrusters.
 
     ## Starting State
 
@@ -137,14 +141,16 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
     Terminated on success: within `goal_tolerance` of the goal in position, heading (whole turns do
     not matter), speed and rate; at the final time only, if `terminate_early=False`. Terminated on
     the first contact, if `terminate_on_contact=True`. Truncated at the final time, or when the
-    centre leaves the table, which only `contacts=False` makes possible.
+    centre leaves the table, as it can with `contacts=False`, or if something pushes it through a
+    wall within one sub-step.
 
     ## Info
 
     `is_success`, `goal_error` (position m, heading rad, speed m/s, rate rad/s), `cost` so far,
     `fuel` so far (thrust impulse of all thrusters in N s), `firing_time` of each thruster so far in
     s (for `delta_v` what the impulses would take), `contacts` of the last step (`count`, `impulse`
-    in N s, `with`: obstacle indices and `"wall"`). All of it is true, whatever is measured.
+    in N s, `with`: obstacle indices and `"wall"`). Errors and contacts are true, whatever is
+    measured; cost and fuel are at nominal thrust, and a failed thruster does not fire.
 
     ## Arguments
 
@@ -156,16 +162,17 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
       `Scenario`; all but the last can be stored in an environment's spec.
     * `n_obstacles`: of random scenes, a number or the range `(least, most)`; default 4.
     * `obstacle_speed`: largest speed in m/s of the obstacles of random scenes.
-    * `final_time`: in s.
+    * `final_time`: in s, a multiple of 0.5 s in every action mode.
     * `reward`: `"paper"` or `"dense"`.
     * `success_reward`: added to the reward on success.
     * `terminate_early`: whether success ends the episode before the final time.
-    * `terminate_on_contact`: whether a contact ends it.
+    * `terminate_on_contact`: whether a contact ends it, without the reward of a success.
     * `goal_tolerance`: `(position m, heading rad, speed m/s, rate rad/s)`.
     * `sub_steps`: physics steps in a control step. In `delta_v` free flight does not depend on
       them; under thrust that turns with the robot the error is of second order in their length,
-      and pulses are whole numbers of them. Contacts are found at their ends, after an overlap of
-      up to one sub-step's motion (50 ms in `delta_v`).
+      and pulses are whole numbers of them. Contacts are found at their ends (with ten, every 50
+      ms in `delta_v` and every 10 ms in the thruster modes); what is thinner than the motion of one
+      sub-step can be missed.
     * `max_obstacles`: rows of the `obstacles` observation; default: the scene's, at least 4.
     * `moving_obstacles`: whether rows of `obstacles` have velocities; default: if any can move.
     * `restitution`, `friction`: of all contacts.
@@ -213,24 +220,45 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         lidar_rays: int = 32,
         render_mode: str | None = None,
     ) -> None:
+        arguments = {name: repr(value) for name, value in locals().items() if name != "self"}
+        self._made = {**arguments, "render_mode": ""}  # what snapshots have to agree in
         require_choice("action_mode", action_mode, ACTION_MODES)
         require_choice("reward", reward, REWARDS)
-        self.modalities = (observation,) if isinstance(observation, str) else tuple(observation)
+        self.modalities = (
+            (observation,) if isinstance(observation, str) else tuple(observation or ())
+        )
         for modality in self.modalities or ("none",):
             require_choice("observation", modality, MODALITIES)
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(
                 f"render_mode must be None, 'rgb_array' or 'human', got {render_mode!r}."
             )
-        for name, value in (("sub_steps", sub_steps), ("lidar_rays", lidar_rays)):
-            if value < 1:
-                raise ValueError(f"{name} must be at least 1, got {value}.")
-        if len(image_size) != 2 or min(image_size) < 8:
+        for name, count in (("sub_steps", sub_steps), ("lidar_rays", lidar_rays)):
+            require_integer(name, count, 1)
+        if max_obstacles is not None:
+            require_integer("max_obstacles", max_obstacles, 0)
+        for name, flag in (
+            ("terminate_early", terminate_early),
+            ("terminate_on_contact", terminate_on_contact),
+            ("contacts", contacts),
+        ):
+            if not isinstance(flag, bool | np.bool_):
+                raise ValueError(f"{name} must be True or False, got {flag!r}.")
+        for name, number in (
+            ("final_time", final_time),
+            ("success_reward", success_reward),
+            ("obstacle_speed", obstacle_speed),
+        ):
+            require_number(name, number)
+        size: Any = image_size
+        if np.shape(size) != (2,) or not all(isinstance(n, int | np.integer) for n in size):
+            raise ValueError(f"image_size must be (height, width) in pixels, got {image_size!r}.")
+        if min(image_size) < 8:
+            raise ValueError(f"image_size must be at least 8 pixels each, got {image_size}.")
+        if np.shape(goal_tolerance) != (4,) or not all(value > 0.0 for value in goal_tolerance):
             raise ValueError(
-                f"image_size must be (height, width) of at least 8 pixels, got {image_size}."
+                f"goal_tolerance must be four positive numbers, got {goal_tolerance!r}."
             )
-        if len(goal_tolerance) != 4 or not all(value > 0.0 for value in goal_tolerance):
-            raise ValueError(f"goal_tolerance must be four positive numbers, got {goal_tolerance}.")
         if not 0.0 <= obstacle_speed <= MAX_OBSTACLE_SPEED:
             raise ValueError(
                 f"obstacle_speed must be in [0, {MAX_OBSTACLE_SPEED:g}] m/s, got {obstacle_speed}."
@@ -241,12 +269,17 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         self.terminate_early, self.terminate_on_contact = terminate_early, terminate_on_contact
         self.restitution, self.friction, self.contacts = restitution, friction, contacts
         self.disturbances = Disturbances.of(disturbances)
+        is_counted = n_obstacles is not None
         if n_obstacles is None:
             n_obstacles = (
                 _MAX_OBSTACLES if max_obstacles is None else min(max_obstacles, _MAX_OBSTACLES)
             )
         self.obstacle_speed, self.n_obstacles = float(obstacle_speed), _obstacle_range(n_obstacles)
         self.fixed_scenario = _scenario(scenario)
+        if self.fixed_scenario is not None and (obstacle_speed or is_counted):
+            raise ValueError(
+                "n_obstacles and obstacle_speed are for scenario='random' only; leave them out."
+            )
         self.base_scenario = base = self.fixed_scenario or Scenario()
         most = len(base.obstacles) if self.fixed_scenario else self.n_obstacles[1]
         self.max_obstacles = max(most, _MAX_OBSTACLES) if max_obstacles is None else max_obstacles
@@ -370,7 +403,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         if self._ended:
             gym.logger.warn("step() was called after the episode's end; call reset() first.")
         if self._pending:
-            self._pending.append(action)
+            self._pending.append(action.copy())  # the caller may reuse the array
             action = self._pending.popleft()
         effort = self._act(world, action)
         self._cost += effort
@@ -382,6 +415,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         at_end = self._step_count >= self._n_steps
         success = bool(info["is_success"] and (at_end or self.terminate_early))
         crashed = self.terminate_on_contact and info["contacts"]["count"] > 0
+        success = success and not crashed
         terminated = success or crashed
         truncated = not terminated and (at_end or self._off_table(state))
         reward = -effort + (self.success_reward if success and not self._ended else 0.0)
@@ -427,19 +461,33 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             self._window = None
 
     def save(self) -> dict[str, Any]:
-        """A snapshot of the episode, for :meth:`restore`; independent of what follows."""
+        """A snapshot of the episode, for :meth:`restore`; independent of what follows.
+
+        Within a contact it takes as long as the contact has lasted: pymunk has to go through it
+        again.
+        """
         self._require_world()
-        return copy.deepcopy({name: getattr(self, name) for name in _EPISODE})
+        episode = copy.deepcopy({name: getattr(self, name) for name in _EPISODE})
+        return {"made": self._made, **episode}
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Goes back to a snapshot of this environment, or of one that was made alike.
 
-        From there the same actions lead to the same bits, random numbers included.
+        From there the same actions lead to the same bits, random numbers included. An environment
+        of ``gym.make`` has to be reset once before it steps.
+
+        Raises:
+            ValueError: If it is no snapshot, or one of an environment made with other arguments.
         """
-        if set(snapshot) != set(_EPISODE):
+        if set(snapshot) != {"made", *_EPISODE}:
             raise ValueError("restore() takes what save() gave.")
+        if snapshot["made"] != self._made:
+            raise ValueError(
+                "restore() takes snapshots of an environment that was made with the same arguments."
+            )
         for name, value in copy.deepcopy(snapshot).items():
-            setattr(self, name, value)
+            if name != "made":
+                setattr(self, name, value)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_window": None}
@@ -563,9 +611,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         return np.clip(rows, box.low, box.high)
 
     def _off_table(self, state: list[float]) -> bool:
-        """Whether the centre has left the table, as it can where there are no contacts."""
-        if self.contacts:
-            return False
+        """Whether the centre has left the table: without contacts, or pushed through a wall."""
         x, y, (width, height) = state[0], state[1], self.base_scenario.table
         return not (0.0 <= x <= width and 0.0 <= y <= height)
 
@@ -585,7 +631,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
             and error[1] <= heading
             and error[2] <= speed
             and error[3] <= rate,
-            "goal_error": error,
+            "goal_error": np.array(error),
             "cost": self._cost,
             "fuel": self._thrust * sum(self._firing_time),
             "firing_time": np.array(self._firing_time),
@@ -609,6 +655,11 @@ def _scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
     """The scenario that an environment's argument names; None for random ones."""
     if isinstance(given, Scenario):
         return given
+    if not isinstance(given, str | Sequence | np.ndarray):
+        raise ValueError(
+            "scenario must be 'random', a scene's name, rows (x, y, radius) or a Scenario, "
+            f"got {given!r}."
+        )
     if not isinstance(given, str):
         return replace(Scenario(), obstacles=Obstacles.from_rows(given))
     return None if given == "random" else Scenario.named(given)
@@ -616,7 +667,10 @@ def _scenario(given: str | Scenario | list[list[float]]) -> Scenario | None:
 
 def _obstacle_range(given: int | tuple[int, int]) -> tuple[int, int]:
     """The range ``(least, most)`` that the argument ``n_obstacles`` means."""
-    least, most = (given, given) if isinstance(given, int | np.integer) else given
+    pair = (given, given) if isinstance(given, int | np.integer) else given
+    is_pair = isinstance(pair, Sequence) and len(pair) == 2
+    whole = is_pair and all(isinstance(count, int | np.integer) for count in pair)
+    least, most = pair if whole else (0, -1)
     if not 0 <= least <= most:
         raise ValueError(
             f"n_obstacles must be a number >= 0 or a range (least, most), got {given!r}."

@@ -307,6 +307,9 @@ class Problem:
             scenario: Supplies robot, table and step; its obstacles are replaced.
         """
         data = dict(data)
+        known = {"start", "goal", "obstacles", "final_time", "waypoints", "state", "time_to_go"}
+        if unknown := sorted(set(data) - known):
+            raise ValueError(f"A problem has no {unknown}; it has {sorted(known)}.")
         if "state" in data and "time_to_go" in data:
             data["start"] = data.pop("state")
             data["final_time"] = float(np.asarray(data.pop("time_to_go")).item())

@@ -128,6 +128,20 @@ def require_choice(name: str, value: Any, choices: Iterable[str]) -> None:
         raise ValueError(f"{name} must be one of {choices}, got {value!r}.{hint}")
 
 
+def require_integer(name: str, value: Any, least: int) -> None:
+    """Raises a ``ValueError`` unless a value is a whole number of at least ``least``."""
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    if not whole or value < least:
+        raise ValueError(f"{name} must be at least {least}, a whole number, got {value!r}.")
+
+
+def require_number(name: str, value: Any) -> None:
+    """Raises a ``ValueError`` unless a value is a finite number."""
+    real = isinstance(value, int | float | np.integer | np.floating)
+    if not real or isinstance(value, bool) or not np.isfinite(value):
+        raise ValueError(f"{name} must be a finite number, got {value!r}.")
+
+
 def require_fit(problem: Problem, base: Scenario, space: spaces.Dict) -> None:
     """Checks that an environment made for ``base`` can pose a problem.
 

@@ -245,8 +245,7 @@ class _Contacts:
         every.engaged[worlds] = (self._age < _PERSISTENCE).any(axis=1)
         every.contact_count[worlds] = self._count
         every.contact_impulse[worlds] = self._impulse
-        told = (self._count > 0) | (self._impulse > 0.0)
-        touched = (self._age < sub_steps) & told[:, None]
+        touched = self._age < sub_steps
         every.touched[worlds, :-1] = touched[:, :3:-1]
         every.touched[worlds, -1] = touched[:, :4].any(axis=1)
 

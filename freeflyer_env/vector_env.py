@@ -386,9 +386,7 @@ class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         return np.abs(impulses).sum(axis=0)
 
     def _off_table(self) -> BoolArray:
-        """Where the centre has left the table, as it can without contacts."""
-        if self._single.contacts:
-            return np.zeros(self.num_envs, dtype=bool)
+        """Where the centre has left the table."""
         (x, y), (width, height) = self._worlds.state[:2], self._worlds.table
         return (x < 0.0) | (x > width) | (y < 0.0) | (y > height)
 

@@ -25,8 +25,9 @@ class FlatObservation(gym.ObservationWrapper, RecordConstructorArgs):
     global one for ``delta_v``, the robot's for thrusters. These are ``(x, y)`` to the goal in m,
     sine and cosine of the turn to it, the velocity relative to the goal's in 0.1 m/s, the rate
     relative to the goal's in 0.3 rad/s, the time left in 40 s, and for each row of ``obstacles``
-    where its centre is in m, its radius in m, and 1 for an obstacle or 0 for padding; then ranges
-    of the lidar in m. Values are cut off at 10.
+    where its centre is in m, its radius in m, 1 for an obstacle or 0 for padding, and, if
+    obstacles can move, its velocity in 0.1 m/s; then ranges of the lidar in m. Values are cut off
+    at 10.
 
     Args:
         env: ``FreeFlyer-v0`` with the modality ``"state"`` or ``"robot"``, with or without
@@ -45,7 +46,10 @@ class FlatObservation(gym.ObservationWrapper, RecordConstructorArgs):
                 "FlatObservation needs observation='state' or 'robot', with or without 'lidar', "
                 f"got {sorted(boxes)}."
             )
-        size = 8 + 4 * boxes["obstacles"].shape[0] if "obstacles" in boxes else 8
+        size = 8
+        if "obstacles" in boxes:
+            rows, columns = boxes["obstacles"].shape
+            size += rows * (columns + 1)
         size += boxes["lidar"].shape[0] if "lidar" in boxes else 0
         self.observation_space = spaces.Box(-_FAR, _FAR, (size,), np.float32)
         base: Any = env.unwrapped
@@ -68,7 +72,10 @@ class FlatObservation(gym.ObservationWrapper, RecordConstructorArgs):
             rows = observation["obstacles"].astype(np.float64)
             mask = obstacle_mask(rows)[:, None]
             centres = (rows[:, :2] - state[:2]) @ into_frame.T
-            table = np.hstack([centres / _LENGTH, rows[:, 2:3] / _LENGTH, mask])
+            velocities = rows[:, 3:] @ into_frame.T if rows.shape[1] == 5 else rows[:, 3:]
+            table = np.hstack(
+                [centres / _LENGTH, rows[:, 2:3] / _LENGTH, mask, velocities / _SPEED]
+            )
             parts.append((table * mask).ravel())
         if "lidar" in observation:
             parts.append(observation["lidar"] / _LENGTH)
@@ -95,9 +102,9 @@ class GoalObservation(gym.ObservationWrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self, reward=reward)
         gym.ObservationWrapper.__init__(self, env)
         boxes = _boxes(env)
-        if "state" not in boxes:
+        if "state" not in boxes or "image" in boxes or "lidar" in boxes:
             raise ValueError(
-                f"GoalObservation needs observation='state' or 'robot', got {sorted(boxes)}."
+                f"GoalObservation needs observation='state' or 'robot' alone, got {sorted(boxes)}."
             )
         if reward not in ("sparse", "dense"):
             raise ValueError(f"reward must be 'sparse' or 'dense', got {reward!r}.")

@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from freeflyer_env.planning.trajectory import Trajectory
 
 
+#: A plan that begins further than this many m from the robot is not for it.
+_FAR_FROM_START = 0.1
+
+
 @dataclass(frozen=True, eq=False)
 class Flight:
     """A recorded flight.
@@ -67,12 +71,23 @@ def fly(
         on_step: Called after every step, to draw frames for example.
 
     Raises:
-        ValueError: If the environment has another action mode.
+        ValueError: If the environment has another action mode or a wrapper that changes actions, or
+            if there is no plan, or one from elsewhere.
     """
     base: Any = env.unwrapped
     if base.action_mode != "thrusters":
         raise ValueError(
             f"fly() needs action_mode='thrusters', the environment has {base.action_mode!r}."
+        )
+    if env.action_space != base.action_space:
+        raise ValueError("fly() sends duties: leave out wrappers that change the actions.")
+    if trajectory is None:
+        raise ValueError("fly() needs a plan; planning failed, see the result's message.")
+    away = float(np.hypot(*(trajectory.states[0, :2] - base.state[:2])))
+    if away > _FAR_FROM_START:
+        raise ValueError(
+            f"The plan starts {away:.2f} m from the robot: reset the environment with "
+            "options={'problem': problem} of the plan."
         )
     tracker = tracker or PIDTracker(base.robot)
     tracker.reset()

@@ -470,3 +470,46 @@ def test_frames_are_collected_and_recorded(tmp_path):
         env.step(np.zeros(3))
     env.close()
     assert [path.suffix for path in tmp_path.glob("*.mp4")] == [".mp4"]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_delayed_command_is_the_one_that_was_given(mode):
+    """Whoever steps may use one array again and again."""
+
+    def fly(reuse):
+        env = make(action_mode=mode, disturbances={"delay": 2})
+        env.reset(seed=0)
+        env.action_space.seed(0)
+        buffer = np.zeros_like(env.action_space.sample())
+        for _ in range(20):
+            action = env.action_space.sample()
+            buffer[...] = action
+            env.step(buffer if reuse else action)
+        return env.unwrapped.state
+
+    np.testing.assert_array_equal(fly(True), fly(False))
+
+
+def test_whoever_is_pushed_off_the_table_is_truncated():
+    env = make(sub_steps=1, scenario=[])
+    start, goal = [0.3, 1.0, 0, -2.5, 0, 0], [3, 1.0, 0, 0, 0, 0]
+    env.reset(options={"problem": Problem(env.unwrapped.scenario, start, goal)})
+    assert env.step(np.zeros(3))[3]
+
+
+def test_a_crash_is_no_success():
+    goal = [0.2, 1.0, 0, 0, 0, 0]
+    problem = Problem(Scenario(Obstacles.from_rows([])), [0.2, 1.0, 0, -0.3, 0, 0], goal)
+    env = make(terminate_on_contact=True, goal_tolerance=(1.0, 1.0, 1.0, 1.0))
+    env.reset(options={"problem": problem})
+    _, reward, terminated, _, _ = env.step(np.zeros(3))
+    assert terminated
+    assert reward == 0.0
+
+
+def test_a_snapshot_of_another_environment_is_refused():
+    env, other = make().unwrapped, make(max_obstacles=8).unwrapped
+    for each in (env, other):
+        each.reset(seed=0)
+    with pytest.raises(ValueError, match="made with the same arguments"):
+        other.restore(env.save())

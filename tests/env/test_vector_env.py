@@ -62,7 +62,7 @@ def check_agreement(together, states, single, alone):
         assert infos["contacts"]["count"][index] == contacts["count"]
         assert infos["contacts"]["impulse"][index] == pytest.approx(contacts["impulse"], rel=1e-6)
         names = [*range(len(touched) - 1), "wall"]
-        assert {name for name, hit in zip(names, touched) if hit} <= set(contacts["with"])
+        assert {name for name, hit in zip(names, touched) if hit} == set(contacts["with"])
 
 
 @pytest.mark.parametrize("reward", ["paper", "dense"])
