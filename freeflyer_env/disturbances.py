@@ -139,11 +139,6 @@ class Disturbances:
                 raise ValueError(f"Disturbances have no field {name!r}.{hint}")
         return cls(**given)
 
-    @property
-    def any_at_all(self) -> bool:
-        """Whether anything is disturbed."""
-        return self != Disturbances()
-
     @cached_property
     def any_plant(self) -> bool:
         """Whether the robot or the table differ from the nominal ones."""

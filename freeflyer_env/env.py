@@ -616,6 +616,7 @@ class FreeFlyerEnv(gym.Env[dict[str, Any], Any]):
         return not (0.0 <= x <= width and 0.0 <= y <= height)
 
     def _goal_error(self, state: list[float]) -> tuple[float, float, float, float]:
+        """What :func:`goal_errors` gives, in plain floats."""
         x, y, psi, v_x, v_y, omega = map(operator.sub, state, self._aim)
         return (
             math.hypot(x, y),
@@ -676,6 +677,20 @@ def _obstacle_range(given: int | tuple[int, int]) -> tuple[int, int]:
             f"n_obstacles must be a number >= 0 or a range (least, most), got {given!r}."
         )
     return int(least), int(most)
+
+
+def goal_errors(differences: FloatArray) -> FloatArray:
+    """Errors in position (m), heading (rad), speed (m/s) and rate (rad/s) of many states at once.
+
+    Args:
+        differences: ``(6, ...)`` states less their goals.
+
+    Returns:
+        ``(4, ...)``; whole turns do not count.
+    """
+    x, y, psi, v_x, v_y, rate = differences
+    turn = np.abs((psi + np.pi) % (2.0 * np.pi) - np.pi)
+    return np.stack([np.sqrt(x * x + y * y), turn, np.sqrt(v_x * v_x + v_y * v_y), np.abs(rate)])
 
 
 def _potential(error: tuple[float, float, float, float]) -> float:

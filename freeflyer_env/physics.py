@@ -128,11 +128,6 @@ class World:
         """Heading in rad."""
         return self._centre_of_mass()[2]
 
-    @property
-    def time(self) -> float:
-        """Time in s, which says where moving obstacles are."""
-        return self._time
-
     def kick(self, velocity_change: tuple[float, float, float]) -> None:
         """Changes ``(v_x, v_y, omega)`` of the hull's centre at once, as an impulse does."""
         vx, vy, turn = velocity_change
@@ -167,27 +162,14 @@ class World:
         wrenches = None if wrenches_body is None else wrenches_body.tolist()
         if wrenches is None and any(self.plant.acceleration):
             wrenches = [[0.0, 0.0, 0.0]] * sub_steps
+        if not (self._engaged or self._has_room(duration, wrenches)):
+            self._engage()
         if self._engaged:
             self._advance(h, sub_steps, wrenches)
         elif wrenches is None:
-            if self._has_room(duration):
-                self._drift(duration)
-            else:
-                self._engage()
-                self._advance(h, sub_steps, None)
-        elif self._has_room(duration, wrenches):
-            self._glide(h, wrenches)
+            self._drift(duration)
         else:
-            for index, wrench in enumerate(wrenches):
-                half = self._half_kick(h, wrench)
-                self._kick(*half)
-                if not self._has_room(h):
-                    self._kick(-half[0], -half[1], -half[2])
-                    self._engage()
-                    self._advance(h, sub_steps - index, wrenches[index:])
-                    break
-                self._drift(h)
-                self._kick(*half)
+            self._glide(h, wrenches)
 
     def ranges(self, angles: FloatArray, reach: float) -> FloatArray:
         """Distances ``(n,)`` in m from the hull's centre to what lies in the directions.
@@ -227,20 +209,21 @@ class World:
         self._engaged = False
         self._free, self._time, self._room = list(centre_of_mass), time, room
 
-    def _has_room(self, duration: float, wrenches: list[list[float]] | None = None) -> bool:
-        """Whether nothing can be touched for so long at the present velocity, or under thrust."""
+    def _has_room(self, duration: float, wrenches: list[list[float]] | None) -> bool:
+        """Whether nothing can be touched for so long, drifting or under body wrenches."""
         if not self._solid:
             return True
         _, _, _, vx, vy, rate = self._free
-        way = duration * (math.hypot(vx, vy) + self._obstacle_speed) + _MARGIN
+        speed, rate = math.hypot(vx, vy), abs(rate)
+        arm = 0.0 if self._balanced else math.hypot(*self.plant.com)
         if wrenches is not None:
-            if not self._balanced:
-                return False
-            push = max([abs(fx) + abs(fy) for fx, fy, _ in wrenches]) / self.plant.robot.mass
-            ax, ay = self.plant.acceleration
-            way += duration * duration * (push + abs(ax) + abs(ay))
-        if not self._balanced:
-            way += duration * abs(rate) * math.hypot(*self.plant.com)
+            (ax, ay), robot = self.plant.acceleration, self.plant.robot
+            push = max([abs(fx) + abs(fy) for fx, fy, _ in wrenches])
+            speed += duration * (push / robot.mass + abs(ax) + abs(ay))
+            if arm:
+                torque = max([abs(torque) for _, _, torque in wrenches])
+                rate += duration * (torque + arm * push) / robot.inertia
+        way = duration * (speed + arm * rate + self._obstacle_speed) + _MARGIN
         if way > self._room:
             self._room = self._clearance()
         if way > self._room:
@@ -285,18 +268,10 @@ class World:
         self._time += duration
 
     def _glide(self, h: float, wrenches: list[list[float]]) -> None:
-        """Sub-steps of ``h`` seconds under thrust with nothing near, in plain floats."""
+        """Sub-steps of ``h`` seconds, one under each body wrench, with nothing near."""
         x, y, psi, vx, vy, rate = self._free
-        robot, (cx, cy), (ax, ay) = self.plant.robot, self.plant.com, self.plant.acceleration
-        half, inertia = 0.5 * h, robot.inertia
-        gain = half / robot.mass
-        ax, ay = half * ax, half * ay
-        for fx, fy, torque in wrenches:
-            alpha = (torque - (cx * fy - cy * fx)) / inertia
-            middle = psi + half * (rate + 0.5 * half * alpha)
-            cos, sin = math.cos(middle), math.sin(middle)
-            dx, dy = gain * (cos * fx - sin * fy) + ax, gain * (sin * fx + cos * fy) + ay
-            turn = half * alpha
+        for wrench in wrenches:
+            dx, dy, turn = self._half_kick(h, wrench, psi, rate)
             vx, vy, rate = vx + dx, vy + dy, rate + turn
             x, y, psi = x + h * vx, y + h * vy, psi + h * rate
             vx, vy, rate = vx + dx, vy + dy, rate + turn
@@ -314,12 +289,13 @@ class World:
         free[4] += dy
         free[5] += turn
 
-    def _half_kick(self, h: float, wrench: list[float]) -> tuple[float, float, float]:
+    def _half_kick(
+        self, h: float, wrench: list[float], psi: float, rate: float
+    ) -> tuple[float, float, float]:
         """Half of the velocity change of a step of ``h`` seconds under a body wrench."""
         (fx, fy, torque), (ax, ay) = wrench, self.plant.acceleration
         robot, (x, y) = self.plant.robot, self.plant.com
         alpha = (torque - (x * fy - y * fx)) / robot.inertia
-        _, _, psi, _, _, rate = self._centre_of_mass()
         middle = psi + 0.5 * h * (rate + 0.25 * h * alpha)
         cos, sin, half = math.cos(middle), math.sin(middle), 0.5 * h
         gain = half / robot.mass
@@ -360,7 +336,7 @@ class World:
         assert self._space is not None
         if wrenches is not None:
             for wrench in wrenches:
-                half = self._half_kick(h, wrench)
+                half = self._half_kick(h, wrench, self._body.angle, self._body.angular_velocity)
                 self._kick_body(*half)
                 self._step(h)
                 self._kick_body(*half)

@@ -136,21 +136,8 @@ class Robot:
         wrench_body = np.asarray(wrench_body, dtype=np.float64)
         if wrench_body.ndim == 1:
             return np.array(self.allocate_one(*wrench_body.tolist()))
-        signed = self._signed_clusters(wrench_body) / self.thrust
-        ordered = np.sort(signed, axis=-1)
-        # The sum of magnitudes is smallest between the two middle values, and every magnitude is
-        # within 1 from `low` to `high`; where nothing is, the middle needs the least scaling.
-        shift = np.maximum(np.minimum(0.0, ordered[..., 2]), ordered[..., 1])
-        low, high = ordered[..., 3] - 1.0, ordered[..., 0] + 1.0
-        shift = np.maximum(np.minimum(shift, high), low)
-        shift = np.where(low > high, 0.5 * (low + high), shift)
-        clusters = (signed - shift[..., None]) * _FREE_CLUSTERS
-        clusters = clusters / np.maximum(np.abs(clusters).max(axis=-1, keepdims=True), 1.0)
-        duties = np.zeros((*clusters.shape[:-1], 8))
-        forward, backward = zip(*CLUSTER_THRUSTERS)
-        duties[..., forward] = np.maximum(clusters, 0.0)
-        duties[..., backward] = np.maximum(-clusters, 0.0)
-        return duties
+        signed = np.moveaxis(self._signed_clusters(wrench_body), -1, 0) / self.thrust
+        return np.ascontiguousarray(np.moveaxis(allocate_clusters(signed), 0, -1))
 
     def allocate_one(self, force_x: float, force_y: float, torque: float) -> list[float]:
         """What :meth:`allocate` does, for one wrench in plain floats: ten times as fast."""
@@ -198,3 +185,35 @@ def body_from_world(psi: FloatArray | float, vector: FloatArray) -> FloatArray:
     cos, sin = np.cos(psi), np.sin(psi)
     x, y = vector[..., 0], vector[..., 1]
     return np.stack([cos * x + sin * y, -sin * x + cos * y, vector[..., 2]], axis=-1)
+
+
+def allocate_clusters(signed: FloatArray) -> FloatArray:
+    """Duties for cluster thrusts whose signs make the freedom of the allocation a shift.
+
+    Args:
+        signed: ``(4, ...)`` pseudo-inverse cluster thrusts in units of one thruster's, the signs of
+            the last two changed.
+
+    Returns:
+        ``(8, ...)`` duties in [0, 1], the least propellant; see :meth:`Robot.allocate`.
+    """
+    a, b, c, d = signed
+    (low_1, high_1), (low_2, high_2) = (
+        (np.minimum(p, q), np.maximum(p, q)) for p, q in ((a, b), (c, d))
+    )
+    first, fourth = np.minimum(low_1, low_2), np.maximum(high_1, high_2)
+    inner = np.maximum(low_1, low_2), np.minimum(high_1, high_2)
+    second, third = np.minimum(*inner), np.maximum(*inner)
+    # The sum of magnitudes is smallest between the two middle values, and every magnitude is
+    # within 1 from `low` to `high`; where nothing is, the middle needs the least scaling.
+    shift = np.maximum(np.minimum(0.0, third), second)
+    low, high = fourth - 1.0, first + 1.0
+    shift = np.where(low > high, 0.5 * (low + high), np.maximum(np.minimum(shift, high), low))
+    clusters = signed - shift
+    clusters[2:] *= -1.0
+    clusters /= np.maximum(np.abs(clusters).max(axis=0), 1.0)
+    duties = np.empty((8, *signed.shape[1:]))
+    for value, (forward, backward) in zip(clusters, CLUSTER_THRUSTERS):
+        np.maximum(value, 0.0, out=duties[forward])
+        np.maximum(-value, 0.0, out=duties[backward])
+    return duties

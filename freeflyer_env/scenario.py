@@ -308,6 +308,7 @@ class Problem:
         """
         data = dict(data)
         known = {"start", "goal", "obstacles", "final_time", "waypoints", "state", "time_to_go"}
+        known |= {"image", "lidar"}  # of an observation
         if unknown := sorted(set(data) - known):
             raise ValueError(f"A problem has no {unknown}; it has {sorted(known)}.")
         if "state" in data and "time_to_go" in data:

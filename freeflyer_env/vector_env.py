@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from freeflyer_env.control import PulseWidthModulator
 from freeflyer_env.disturbances import Disturbances
-from freeflyer_env.env import ERROR_WEIGHTS, REACH_TOLERANCE, FreeFlyerEnv
-from freeflyer_env.robot import CLUSTER_THRUSTERS, FloatArray
+from freeflyer_env.env import ERROR_WEIGHTS, REACH_TOLERANCE, FreeFlyerEnv, goal_errors
+from freeflyer_env.robot import FloatArray, allocate_clusters
 from freeflyer_env.scenario import Obstacles, sample_states, sample_tables
 from freeflyer_env.vector_contacts import IntArray, Worlds
 
@@ -119,11 +119,6 @@ class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         """States ``(num_envs, 6)`` as in the single environment, float64, a fresh array."""
         return np.ascontiguousarray(self._worlds.state.T)
 
-    @property
-    def goals(self) -> FloatArray:
-        """Goal states ``(num_envs, 6)``, float64, a fresh array."""
-        return self._goals.copy()
-
     def reset(
         self,
         *,
@@ -201,9 +196,9 @@ class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         success = (
             infos["is_success"].copy() if single.terminate_early else infos["is_success"] & at_end
         )
-        terminated = success & ~renewed
-        if single.terminate_on_contact:
-            terminated |= (worlds.contact_count > 0) & ~renewed
+        crashed = (worlds.contact_count > 0) & single.terminate_on_contact
+        success &= ~crashed
+        terminated = (success | crashed) & ~renewed
         truncated = ((at_end | self._off_table()) & ~terminated) & ~renewed
         rewards = single.success_reward * success - efforts
         if single.reward == "dense":
@@ -379,7 +374,7 @@ class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
         excess = (0.5 / limit) * (signed.max(axis=0) - signed.min(axis=0))
         scale = 1.0 / np.where(excess > 1.0 + REACH_TOLERANCE, excess, 1.0)
         impulses = actions * scale
-        self._duties = _allocate(signed * (scale / limit))
+        self._duties = allocate_clusters(signed * (scale / limit))
         self._firing_times += period * self._duties
         state[3:] += impulses * robot.control_gain[:, None]
         self._worlds.advance(period, self._single.sub_steps)
@@ -394,15 +389,7 @@ class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
 
     def _errors(self) -> FloatArray:
         """``(4, n)`` errors to the goals in m, rad, m/s and rad/s."""
-        x, y, psi, v_x, v_y, rate = self._worlds.state - self._goals.T
-        return np.stack(
-            [
-                np.sqrt(x * x + y * y),
-                np.abs((psi + np.pi) % (2.0 * np.pi) - np.pi),
-                np.sqrt(v_x * v_x + v_y * v_y),
-                np.abs(rate),
-            ]
-        )
+        return goal_errors(self._worlds.state - self._goals.T)
 
     def _observations(self) -> Observations:
         left = self._final_times - self._steps * self._single.control_dt
@@ -437,28 +424,6 @@ class FreeFlyerVectorEnv(gym.vector.VectorEnv[Any, Any, NDArray[Any]]):
             "contacts": _with_masks(contacts, mask),
             "_contacts": mask.copy(),
         }
-
-
-def _allocate(signed: FloatArray) -> FloatArray:
-    """Duties ``(8, n)`` from cluster thrusts ``(4, n)``, as :meth:`Robot.allocate` gives them."""
-    a, b, c, d = signed
-    (low_1, high_1), (low_2, high_2) = (
-        (np.minimum(p, q), np.maximum(p, q)) for p, q in ((a, b), (c, d))
-    )
-    first, fourth = np.minimum(low_1, low_2), np.maximum(high_1, high_2)
-    inner = np.maximum(low_1, low_2), np.minimum(high_1, high_2)
-    second, third = np.minimum(*inner), np.maximum(*inner)
-    shift = np.maximum(np.minimum(0.0, third), second)
-    low, high = fourth - 1.0, first + 1.0
-    shift = np.where(low > high, 0.5 * (low + high), np.maximum(np.minimum(shift, high), low))
-    clusters = signed - shift
-    clusters[2:] *= -1.0
-    clusters /= np.maximum(np.abs(clusters).max(axis=0), 1.0)
-    duties = np.empty((8, signed.shape[1]))
-    for value, (forward, backward) in zip(clusters, CLUSTER_THRUSTERS):
-        np.maximum(value, 0.0, out=duties[forward])
-        np.maximum(-value, 0.0, out=duties[backward])
-    return duties
 
 
 def _potential(errors: FloatArray) -> FloatArray:

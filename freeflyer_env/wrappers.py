@@ -10,7 +10,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from numpy.typing import NDArray
 
-from freeflyer_env.env import ERROR_WEIGHTS
+from freeflyer_env.env import ERROR_WEIGHTS, goal_errors
 from freeflyer_env.spaces import obstacle_mask
 
 #: Units in which :class:`FlatObservation` measures: m, m/s, rad/s, s.
@@ -143,16 +143,7 @@ class GoalObservation(gym.ObservationWrapper, RecordConstructorArgs):
     ) -> NDArray[np.float32]:
         """Rewards ``(...)`` of states ``(..., 6)`` for goals ``(..., 6)``; ``info`` is not used."""
         difference = np.asarray(achieved_goal, np.float64) - np.asarray(desired_goal, np.float64)
-        turn = np.abs((difference[..., 2] + np.pi) % (2 * np.pi) - np.pi)
-        errors = np.stack(
-            [
-                np.hypot(difference[..., 0], difference[..., 1]),
-                turn,
-                np.hypot(difference[..., 3], difference[..., 4]),
-                np.abs(difference[..., 5]),
-            ],
-            axis=-1,
-        )
+        errors = np.moveaxis(goal_errors(np.moveaxis(difference, -1, 0)), 0, -1)
         if self.reward_type == "dense":
             return np.asarray(-errors @ ERROR_WEIGHTS, dtype=np.float32)
         base: Any = self.env.unwrapped

@@ -66,14 +66,7 @@ class LQRTracker:
     def duties(
         self, state: FloatArray, trajectory: Trajectory, time: float, dt: float
     ) -> FloatArray:
-        """Thruster duties ``(8,)`` for the control period that starts at ``time``.
-
-        Args:
-            state: ``(6,)`` measured state.
-            trajectory: The plan to follow.
-            time: In s since the plan's start.
-            dt: Length of the control period in s.
-        """
+        """Thruster duties ``(8,)``; see :meth:`Tracker.duties`."""
         expected = self.observer.update(state, dt)
         acts_at = time + self.observer.delay * dt
         return self._command(self._feedback(expected, trajectory, acts_at, dt))

@@ -55,14 +55,7 @@ class PIDTracker:
     def duties(
         self, state: FloatArray, trajectory: Trajectory, time: float, dt: float
     ) -> FloatArray:
-        """Thruster duties ``(8,)`` for the control period that starts at ``time``.
-
-        Args:
-            state: ``(6,)`` measured state.
-            trajectory: The plan to follow.
-            time: In s since the plan's start.
-            dt: Length of the control period in s.
-        """
+        """Thruster duties ``(8,)``; see :meth:`Tracker.duties`."""
         reference, acceleration = reference_at(trajectory, time)
         error = reference - state
         self._integral += error[:3] * dt

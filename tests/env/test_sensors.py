@@ -28,6 +28,13 @@ def test_modalities_choose_the_keys():
     assert keys["lidar"].shape == (8,)
 
 
+def test_an_observation_of_any_modality_with_the_state_is_a_problem():
+    observation = observed(observation=("state", "lidar", "image"))
+    again = Problem.from_dict(observation)
+    np.testing.assert_allclose(again.start, PROBLEM.start, atol=1e-6)
+    assert again.final_time == PROBLEM.final_time
+
+
 def test_lidar_measures_discs_and_walls():
     ranges = observed(observation="lidar", lidar_rays=4)["lidar"]
     np.testing.assert_allclose(ranges, [1.5 - 0.2, 1.5, 0.5, 1.0], atol=1e-5)

@@ -150,8 +150,19 @@ def test_contact_may_end_the_episode():
             ]
         }
     )
-    ends = [env.step(np.zeros((2, 3), np.float32))[2] for _ in range(3)]
+    steps = [env.step(np.zeros((2, 3), np.float32)) for _ in range(3)]
+    ends = [step[2] for step in steps]
     np.testing.assert_array_equal(ends, [[False, False], [False, False], [True, False]])
+
+
+def test_a_crash_is_no_success():
+    env = make(1, terminate_on_contact=True, goal_tolerance=(1.0, 1.0, 1.0, 1.0), scenario=[])
+    start, goal = [0.2, 1.0, 0, -0.3, 0, 0], [0.2, 1.0, 0, 0, 0, 0]
+    problem = {"start": start, "goal": goal, "obstacles": [], "final_time": 5.0}
+    env.reset(options={"problem": problem})
+    _, rewards, terminated, _, _ = env.step(np.zeros((1, 3), np.float32))
+    assert terminated[0]
+    assert rewards[0] == 0.0
 
 
 @pytest.mark.parametrize("mode", MODES)
