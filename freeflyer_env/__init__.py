@@ -6,6 +6,7 @@ Importing this package registers ``FreeFlyer-v0``; planners live in :mod:`freefl
 from gymnasium.envs.registration import register, registry
 
 from freeflyer_env.robot import Robot
+from freeflyer_env.sampling import sample_obstacles, sample_problem
 from freeflyer_env.scenario import (
     HELD_OUT_SCENES,
     SCENES,
@@ -13,8 +14,6 @@ from freeflyer_env.scenario import (
     Obstacles,
     Problem,
     Scenario,
-    sample_obstacles,
-    sample_problem,
     unwrap_goal,
 )
 

@@ -1,4 +1,4 @@
-"""``FreeFlyer-v0``: the environment."""
+"""``FreeFlyer-v0``: the environment. The docstring of the class is its page, hence the length."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ from freeflyer_env.control import PulseWidthModulator
 from freeflyer_env.disturbances import Disturbances, Plant
 from freeflyer_env.physics import World
 from freeflyer_env.robot import FloatArray, Robot
-from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_problem
+from freeflyer_env.sampling import sample_problem
+from freeflyer_env.scenario import Obstacles, Problem, Scenario
 from freeflyer_env.sensors import lidar_angles, top_view
 from freeflyer_env.spaces import (
     ACTION_MODES,

@@ -19,16 +19,11 @@ from typing import Any
 import numpy as np
 import pymunk
 
+from freeflyer_env.contact_space import SCENE_CATEGORY, make_space
 from freeflyer_env.disturbances import Plant
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Obstacles, Scenario
 
-_WALL_THICKNESS = 0.5  # m: nothing below 10 m/s tunnels through within 50 ms
-_ROBOT, _WALL, _FIRST_OBSTACLE = 1, 2, 3
-#: Overlap in m that is not pushed out.
-COLLISION_SLOP = 1e-4
-
-_SCENE_CATEGORY, _ROBOT_CATEGORY = 0b01, 0b10
 _MARGIN = 1e-6  # m between hull and surroundings below which pymunk takes over
 
 
@@ -182,7 +177,7 @@ class World:
         if not self._engaged:
             self._place_movers()
         x, y, psi = self.state_values()[:3]
-        seen = pymunk.ShapeFilter(mask=_SCENE_CATEGORY)
+        seen = pymunk.ShapeFilter(mask=SCENE_CATEGORY)
         distances = np.full(len(angles), float(reach))
         for index, angle in enumerate((np.asarray(angles) + psi).tolist()):
             end = (x + reach * math.cos(angle), y + reach * math.sin(angle))
@@ -387,64 +382,10 @@ class World:
     def _require_space(self) -> pymunk.Space:
         """The pymunk space, made when it is first needed."""
         if self._space is None:
-            self._space = self._make_space()
+            self._space, self._body, self._movers = make_space(
+                self.scenario, self.plant, self._surface, self._began, self._solved
+            )
         return self._space
-
-    def _make_space(self) -> pymunk.Space:
-        space = pymunk.Space()
-        space.gravity = (0.0, 0.0)
-        # Chipmunk's defaults think in pixels, here distances are in metres: hardly any overlap is
-        # tolerated, and the rest of it is gone after one step.
-        space.collision_slop = COLLISION_SLOP
-        space.collision_bias = 0.0
-        # The default tree reports pairs in an order that depends on where the robot has been.
-        space.use_spatial_hash(1.0, 100)
-        robot = self.plant.robot
-        self._body = pymunk.Body(robot.mass, robot.inertia)
-        self._body.center_of_gravity = self.plant.com
-        shape = pymunk.Circle(self._body, robot.radius)
-        # Chipmunk multiplies the two shapes' values; the robot's are one.
-        shape.elasticity, shape.friction = 1.0, 1.0
-        shape.collision_type = _ROBOT
-        shape.filter = pymunk.ShapeFilter(categories=_ROBOT_CATEGORY)
-        space.add(self._body, shape)
-        self._add_obstacles(space)
-        self._add_walls(space)
-        return space
-
-    def _add_obstacles(self, space: pymunk.Space) -> None:
-        obstacles = self.scenario.obstacles
-        for index, (centre, radius) in enumerate(zip(obstacles.centres, obstacles.radii)):
-            body, place = space.static_body, tuple(centre.tolist())
-            if obstacles.moving:
-                body, place = pymunk.Body(body_type=pymunk.Body.KINEMATIC), (0.0, 0.0)
-                space.add(body)
-                self._movers.append(body)
-            shape = pymunk.Circle(body, float(radius), place)
-            self._add_fixed(space, shape, _FIRST_OBSTACLE + index)
-            self._report(space, _FIRST_OBSTACLE + index, index)
-
-    def _add_walls(self, space: pymunk.Space) -> None:
-        width, height = self.scenario.table
-        t = _WALL_THICKNESS
-        left, right, low, high = -t, width + t, -t, height + t
-        corners = [(left, low), (right, low), (right, high), (left, high)]
-        for first, second in zip(corners, corners[1:] + corners[:1]):
-            segment = pymunk.Segment(space.static_body, first, second, t)
-            self._add_fixed(space, segment, _WALL)
-        self._report(space, _WALL, "wall")
-
-    def _add_fixed(self, space: pymunk.Space, shape: pymunk.Shape, collision_type: int) -> None:
-        shape.elasticity, shape.friction = self._surface
-        shape.filter = pymunk.ShapeFilter(categories=_SCENE_CATEGORY)
-        shape.collision_type = collision_type
-        space.add(shape)
-
-    def _report(self, space: pymunk.Space, collision_type: int, name: int | str) -> None:
-        """Logs contacts of the robot with shapes of a type under ``name``."""
-        space.on_collision(
-            _ROBOT, collision_type, begin=self._began, post_solve=self._solved, data=name
-        )
 
     def _began(self, _arbiter: pymunk.Arbiter, _space: pymunk.Space, name: int | str) -> None:
         self._touched = True

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from freeflyer_env.physics import COLLISION_SLOP
+from freeflyer_env.contact_space import COLLISION_SLOP, WALL_RADIUS
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Scenario
 
@@ -25,7 +25,6 @@ _ITERATIONS, _PERSISTENCE = 10, 3  # Chipmunk's; the latter in sub-steps
 _MARGIN = 1e-6  # m
 _FAR = 1e6  # m: where discs are that are not there
 _FORGOTTEN = 1000  # sub-steps
-_WALL_THICKNESS = 0.5  # m: half of it
 
 
 class Worlds:
@@ -64,7 +63,7 @@ class Worlds:
         # The surfaces: centres in m, and the distance from there at which the robot touches. In the
         # order in which Chipmunk meets them: walls on the left, above, on the right and below, with
         # one coordinate that matters, then discs, the last one first.
-        thick, (width, height) = _WALL_THICKNESS, self.table
+        thick, (width, height) = WALL_RADIUS, self.table
         self.centres = np.full((2, n, 4 + max_obstacles), _FAR)
         self.centres[0, :, 0:4:2] = -thick, width + thick
         self.centres[1, :, 1:4:2] = height + thick, -thick

@@ -16,7 +16,8 @@ from freeflyer_env.control import PulseWidthModulator
 from freeflyer_env.disturbances import Disturbances
 from freeflyer_env.env import ERROR_WEIGHTS, REACH_TOLERANCE, FreeFlyerEnv, goal_errors
 from freeflyer_env.robot import FloatArray, allocate_clusters
-from freeflyer_env.scenario import Obstacles, sample_states, sample_tables
+from freeflyer_env.sampling import sample_states, sample_tables
+from freeflyer_env.scenario import Obstacles
 from freeflyer_env.vector_contacts import IntArray, Worlds
 
 Observations = dict[str, NDArray[np.float32]]

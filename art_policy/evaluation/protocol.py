@@ -16,7 +16,8 @@ import numpy as np
 from art_policy.planner import PlannerConfig, WarmStartPlanner
 from freeflyer_env.planning import SCPConfig, SCPResult, solve_rel, solve_scp
 from freeflyer_env.planning.homotopy import homotopy_starts
-from freeflyer_env.scenario import HELD_OUT_SCENES, Problem, Scenario, sample_problem
+from freeflyer_env.sampling import sample_problem
+from freeflyer_env.scenario import HELD_OUT_SCENES, Problem, Scenario
 
 if TYPE_CHECKING:
     from art_policy.deployment import OnnxART

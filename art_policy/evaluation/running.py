@@ -13,7 +13,8 @@ import numpy as np
 
 from art_policy.evaluation.protocol import ProblemRecord, evaluate_problem
 from art_policy.evaluation.statistics import finite
-from freeflyer_env.scenario import Problem, Scenario, sample_problem
+from freeflyer_env.sampling import sample_problem
+from freeflyer_env.scenario import Problem, Scenario
 
 if TYPE_CHECKING:
     from art_policy.deployment import OnnxART

@@ -30,7 +30,8 @@ from typing import Any
 
 import numpy as np
 
-from freeflyer_env.scenario import SCENES, Obstacles, Problem, Scenario, sample_problem
+from freeflyer_env.sampling import sample_problem
+from freeflyer_env.scenario import SCENES, Obstacles, Problem, Scenario
 
 _ID_PATTERN = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d+")
 _MAX_STARTS = 64

@@ -11,10 +11,9 @@ import torch
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.rollout import decode_poses, generate, propose, propose_batch
-from freeflyer_env import dynamics
+from freeflyer_env import Obstacles, Problem, Scenario, dynamics, sample_problem
 from freeflyer_env.constraints import actuation_excess, keep_out_depth
 from freeflyer_env.planning import solve_rel, solve_scp
-from freeflyer_env.scenario import Obstacles, Problem, Scenario, sample_problem
 
 MULTI = ARTConfig(width=32, n_layers=1, n_heads=2, n_hypotheses=4)
 SEQUENCE = replace(MULTI, head="autoregressive", context_length=8)
