@@ -246,7 +246,11 @@ def _starts(recipe: Recipe) -> str:
 
 
 def _kept(recipe: Recipe) -> str:
-    return "the cheapest optimum" if recipe.optima == "best" else "every distinct optimum"
+    return {
+        "all": "every distinct optimum",
+        "best": "the cheapest optimum",
+        "first": "the optimum of the first start that is solved",
+    }[recipe.optima]
 
 
 def _table(head: tuple[str, ...], rows: Iterable[tuple[str, ...]]) -> str:

@@ -250,11 +250,11 @@ def _solve(recipe: Recipe, problem: Problem) -> list[dict[str, Any]]:
     from freeflyer_env.planning import SCPConfig, solve_multistart
 
     config = SCPConfig(time_limit=_TIME_LIMIT)
-    found = solve_multistart(problem, n_starts=recipe.n_starts, config=config)
+    found = solve_multistart(problem, recipe.n_starts, config, first_only=recipe.optima == "first")
     if found.rel.trajectory is None:
         return []
     records = [_record(problem, found.rel, LABEL_REL, rank=0, start_number=-1)]
-    optima = found.optima if recipe.optima == "all" else found.optima[:1]
+    optima = found.optima[:1] if recipe.optima == "best" else found.optima
     numbers = {id(result): number for number, result in enumerate(found.results)}
     for rank, optimum in enumerate(optima):
         records.append(_record(problem, optimum, LABEL_SCP, rank, numbers[id(optimum)]))

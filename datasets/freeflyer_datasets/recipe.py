@@ -10,7 +10,7 @@
     n_obstacles = 4                    # or [1, 6]; random scenes only
     final_times = [40.0]               # drawn uniformly; or { range = [40.0, 100.0] }
     n_starts = 6                       # 1: SCP from the relaxed solution alone
-    optima = "all"                     # every distinct local optimum; or "best"
+    optima = "all"                     # every distinct local optimum; or "best", or "first"
 
 Problem ``i`` of a recipe depends on ``(seed, i)`` alone: :meth:`Recipe.problem`.
 """
@@ -34,6 +34,9 @@ from freeflyer_env.sampling import sample_problem
 from freeflyer_env.scenario import SCENES, Obstacles, Problem, Scenario
 
 _ID_PATTERN = re.compile(r"(?:[-\w]+/)*[-\w]+-v\d+")
+#: What is kept of a problem's solutions; see :class:`Recipe`.
+OPTIMA = ("all", "best", "first")
+
 _MAX_STARTS = 64
 _MAX_OBSTACLES = 12
 _MAX_STEPS = 1000
@@ -55,7 +58,9 @@ class Recipe:
             None with named scenes.
         final_times: Final times in s, drawn uniformly.
         n_starts: Warm starts that SCP is started from; the first one is the relaxed solution.
-        optima: ``"best"`` keeps the cheapest solution, ``"all"`` every distinct local optimum.
+        optima: ``"all"`` keeps every distinct local optimum, ``"best"`` the cheapest,
+            ``"first"`` that of the first start that is solved: SCP from REL as in the paper, and
+            other starts only where that fails; about four times as fast.
 
     Raises:
         ValueError: On a value out of range; the message names the field, the value and the range.
@@ -81,8 +86,8 @@ class Recipe:
         _require_int("n_problems", self.n_problems, 1, 100_000_000)
         _require_int("seed", self.seed, 0, 2**63 - 1)
         _require_int("n_starts", self.n_starts, 1, _MAX_STARTS)
-        if self.optima not in ("best", "all"):
-            raise ValueError(f"optima must be 'best' or 'all', got {self.optima!r}.")
+        if self.optima not in OPTIMA:
+            raise ValueError(f"optima must be one of {OPTIMA}, got {self.optima!r}.")
         object.__setattr__(self, "scenes", _scenes(self.scenes))
         object.__setattr__(self, "n_obstacles", _obstacle_range(self.n_obstacles, self.scenes))
         object.__setattr__(self, "final_times", _final_times(self.final_times))

@@ -21,7 +21,7 @@ class MultistartResult:
 
     Attributes:
         rel: The REL solution, start 0 of the list.
-        results: One SCP result per start.
+        results: One SCP result per start that was tried.
         optima: Distinct solved optima, cheapest first.
     """
 
@@ -36,7 +36,11 @@ class MultistartResult:
 
 
 def solve_multistart(
-    problem: Problem, n_starts: int = 6, config: SCPConfig | None = None, n_jobs: int = 1
+    problem: Problem,
+    n_starts: int = 6,
+    config: SCPConfig | None = None,
+    n_jobs: int = 1,
+    first_only: bool = False,
 ) -> MultistartResult:
     """SCP from REL and from up to ``n_starts - 1`` paths in distinct homotopy classes.
 
@@ -47,6 +51,8 @@ def solve_multistart(
         config: Settings of every SCP loop; ``reroutes`` plays no part, the starts are the routes.
         n_jobs: Processes over which the starts are spread; worth it where one problem has to be
             solved fast. For many problems use :func:`solve_many`.
+        first_only: Stop at the first start that is solved: SCP from REL, and other starts only
+            where that fails. One start after the other, whatever ``n_jobs``.
 
     Returns:
         All results; deterministic, no random numbers are used.
@@ -58,6 +64,14 @@ def solve_multistart(
         return MultistartResult(rel, (solve_scp(problem, straight_line(problem), config),), ())
     config = replace(config or SCPConfig(), reroutes=0)
     starts = [rel.trajectory or straight_line(problem)]
+    if first_only:
+        tried = [solve_scp(problem, starts[0], config)]
+        if not tried[0].solved and n_starts > 1:
+            for start in homotopy_starts(problem, n_starts - 1):
+                tried.append(solve_scp(problem, start, config))
+                if tried[-1].solved:
+                    break
+        return MultistartResult(rel, tuple(tried), distinct_optima(tuple(tried)))
     if n_starts > 1:
         starts += homotopy_starts(problem, n_starts - 1)
     if n_jobs == 1 or len(starts) == 1:

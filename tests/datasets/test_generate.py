@@ -134,10 +134,10 @@ def test_an_exception_is_the_failure_of_its_problem(recipe: Recipe, monkeypatch,
 
     target = recipe.problem(1).start
 
-    def explode(problem, n_starts, config):
+    def explode(problem, n_starts, config, **options):
         if np.array_equal(problem.start, target):
             raise ZeroDivisionError("as a test")
-        return solve_multistart(problem, n_starts=n_starts, config=config)
+        return solve_multistart(problem, n_starts, config, **options)
 
     monkeypatch.setattr(planning, "solve_multistart", explode)
     shard = solve_problems(recipe, 0, 2)
@@ -151,7 +151,7 @@ def test_an_exception_is_the_failure_of_its_problem(recipe: Recipe, monkeypatch,
 def test_when_everything_fails_nothing_is_written(recipe: Recipe, tmp_path: Path, monkeypatch):
     import freeflyer_env.planning as planning
 
-    def explode(problem, n_starts, config):
+    def explode(problem, n_starts, config, **options):
         raise ZeroDivisionError("as a test")
 
     monkeypatch.setattr(planning, "solve_multistart", explode)
@@ -268,6 +268,19 @@ def test_a_local_ray_cluster_makes_the_same_bytes(recipe: Recipe, shards, tmp_pa
     assert contents(tmp_path) == contents(shards)
     with pytest.raises(ValueError, match="engine must be one of"):
         generate(recipe, tmp_path, engine="spark")
+
+
+def test_the_first_optimum_is_scp_from_rel_unless_that_fails(recipe: Recipe):
+    fields = {**recipe.to_dict(), "optima": "first", "id": "freeflyer/first-v0"}
+    first, every = (solve_problems(one, 0, 6) for one in (Recipe.from_dict(fields), recipe))
+    assert sorted(set(first.problem[first.label == LABEL_SCP])) == sorted(
+        set(every.problem[every.label == LABEL_SCP])
+    )
+    for row in np.flatnonzero(first.label == LABEL_SCP):
+        same = (every.problem == first.problem[row]) & (every.label == LABEL_SCP)
+        assert first.rank[row] == 0
+        assert first.start_number[row] <= every.start_number[same].min()
+        assert np.abs(every.cost[same] - first.cost[row]).min() < 1e-4
 
 
 def test_only_the_best_optimum_is_kept_on_request(recipe: Recipe):
