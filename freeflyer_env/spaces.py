@@ -114,6 +114,22 @@ def obstacle_rows(
     return rows
 
 
+def rows_at(rows: NDArray[Any], times: NDArray[Any]) -> NDArray[np.float32]:
+    """Rows ``(M, 3)`` or ``(M, 5)`` of obstacles in uniform motion, at later times.
+
+    Args:
+        rows: ``(x, y, radius)``, with ``(v_x, v_y)`` or without, at time zero.
+        times: ``(L,)`` in s.
+
+    Returns:
+        ``(L, M, 3 or 5)``.
+    """
+    table = np.repeat(np.asarray(rows, dtype=np.float64)[None], len(times), axis=0)
+    if table.shape[2] == 5:
+        table[..., :2] += times[:, None, None] * table[..., 3:]
+    return table.astype(np.float32)
+
+
 def obstacle_mask(rows: NDArray[Any]) -> NDArray[np.bool_]:
     """``(..., M)`` which rows ``(..., M, 3 or 5)`` of an observation are obstacles, not padding."""
     return np.asarray(rows)[..., 2] > 0.0

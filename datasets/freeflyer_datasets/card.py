@@ -59,6 +59,7 @@ def dataset_card(
         instead, caption = _CAPTIONS[file]
         shown += f"\n![{instead}]({file})\n\n{caption}\n"
     exported = ", ".join(f"{package} {number}" for package, number in versions.items())
+    rows = f"({recipe.max_obstacles}, {5 if recipe.moving else 3})"
     return f"""---
 license: mit
 viewer: false
@@ -100,10 +101,10 @@ are not kept.
 
 ## Episodes
 
-Observations are dictionaries of `state` (6), `goal` (6), `obstacles` ({recipe.max_obstacles}, 3)
-and `time_to_go` (1), all float32 in SI units and the table frame; actions are impulses per unit
-mass `(dv_x, dv_y, h)`; the reward is minus the 1-norm of the action. The last observation is the
-state after the last impulse. The states are those that the stored actions produce, to 1e-6.
+Observations are dictionaries of `state` (6), `goal` (6), `obstacles` {rows} and `time_to_go` (1),
+all float32 in SI units and the table frame; actions are impulses per unit mass `(dv_x, dv_y, h)`;
+the reward is minus the 1-norm of the action. The last observation is the state after the last
+impulse. The states are those that the stored actions produce, to 1e-6.
 Split by the attribute `problem_index`, never by episode.
 
 ## How it was made

@@ -155,6 +155,8 @@ def environment_spec(recipe: Recipe, *, evaluation: bool = False) -> EnvSpec:
         "final_time": max(recipe.final_times),
         "max_obstacles": recipe.max_obstacles,
     }
+    if recipe.moving:
+        kwargs["moving_obstacles"] = True
     if not evaluation:
         # Relaxed trajectories pass through obstacles, and others slide along the table's edge.
         kwargs |= {"success_reward": 0.0, "terminate_early": False, "contacts": False}

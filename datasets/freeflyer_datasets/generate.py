@@ -238,7 +238,7 @@ def solve_problems(recipe: Recipe, first: int, count: int) -> Shard:
             failures[local] = _UNSOLVED
             continue
         nodes = records[0]["trajectory"].states[:-1, :2]
-        depth = keep_out_depth(problem.scenario, nodes)
+        depth = keep_out_depth(problem.scenario, nodes, problem.node_times[:-1])
         c_rel[local] = int((depth > FEASIBILITY_TOLERANCE).sum())
         rel_cost[local] = records[0]["trajectory"].cost
         rows += [{"problem": local, **record} for record in records]
@@ -292,10 +292,10 @@ def _pack(
     failures: list[str],
     rows: list[dict[str, Any]],
 ) -> Shard:
-    obstacles = np.zeros((len(problems), recipe.max_obstacles, 3))
+    obstacles = np.zeros((len(problems), recipe.max_obstacles, 5 if recipe.moving else 3))
     for local, problem in enumerate(problems):
         table = problem.scenario.obstacles.rows()
-        obstacles[local, : len(table)] = table
+        obstacles[local, : len(table), : table.shape[1]] = table
     lengths = [len(row["controls"]) for row in rows]
 
     def column(name: str, dtype: Any) -> np.ndarray:

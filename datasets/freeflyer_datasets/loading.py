@@ -34,6 +34,7 @@ from freeflyer_datasets.shards import iterate_shards, read_shard, source_digest
 from freeflyer_env import dynamics
 from freeflyer_env.robot import FloatArray, Robot
 from freeflyer_env.scenario import Obstacles, Problem, Scenario
+from freeflyer_env.spaces import rows_at
 
 if TYPE_CHECKING:
     from freeflyer_env.planning import Trajectory
@@ -51,7 +52,8 @@ class PackedDataset:
         dt: Step in s.
         start: ``(P, 6)`` start states.
         goal: ``(P, 6)`` goal states.
-        obstacles: ``(P, M, 3)`` rows (x, y, radius) in m, zero-padded.
+        obstacles: ``(P, M, 3)`` rows (x, y, radius) in m, zero-padded; ``(P, M, 5)`` with
+            velocities (v_x, v_y) in m/s if any move.
         final_time: ``(P,)`` in s.
         c_rel: ``(P,)`` nodes of the problem's REL trajectory that violate keep-out.
         rel_cost: ``(P,)`` cost of the REL trajectory in m/s.
@@ -254,10 +256,11 @@ class PackedDataset:
             problem = self.problem_index[row]
             states = self.states([row])[0, :-1]
             n_steps = len(states)
-            to_go = self.final_time[problem] - self.dt * np.arange(n_steps)[:, None]
-            fixed = np.concatenate([self.goal[problem], self.obstacles[problem].ravel()])
-            fixed = np.broadcast_to(fixed, (n_steps, len(fixed)))
-            observations.append(np.hstack([fixed, states, to_go]).astype(np.float32))
+            times = self.dt * np.arange(n_steps)
+            goal = np.broadcast_to(self.goal[problem], (n_steps, 6))
+            obstacles = rows_at(self.obstacles[problem], times).reshape(n_steps, -1)
+            to_go = self.final_time[problem] - times[:, None]
+            observations.append(np.hstack([goal, obstacles, states, to_go]).astype(np.float32))
             actions.append(self.controls_of([row])[0])
             terminals.append((np.arange(n_steps) == n_steps - 1).astype(np.float32))
         flat = np.concatenate(actions) if actions else np.empty((0, 3), np.float32)

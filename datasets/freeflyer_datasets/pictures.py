@@ -149,8 +149,13 @@ def _panel(axis: Any, shard: Shard, problem: int, scenario: Scenario) -> None:
     """One problem with all its trajectories."""
     from matplotlib.patches import Circle
 
-    for x, y, radius in shard.obstacles[problem]:
+    for x, y, radius, *velocity in shard.obstacles[problem]:
         if radius > 0.0:
+            if any(velocity):
+                way = 0.5 * shard.final_time[problem] * np.array(velocity)
+                axis.annotate(
+                    "", (x + way[0], y + way[1]), (x, y), arrowprops={"arrowstyle": "->", "lw": 0.6}
+                )
             keep_out = (radius + scenario.robot.radius) * scenario.keep_out_factor
             axis.add_patch(Circle((x, y), keep_out, color=_KEEP_OUT, lw=0.0, zorder=0))
             axis.add_patch(Circle((x, y), radius, color=_OBSTACLE, lw=0.0, zorder=1))

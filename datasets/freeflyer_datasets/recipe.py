@@ -8,6 +8,7 @@
     seed = 6
     scenes = "random"                  # or a list of scene names, drawn uniformly
     n_obstacles = 4                    # or [1, 6]; random scenes only
+    obstacle_speeds = [0.0]            # or [0.0, 0.02]: half of the random scenes move
     final_times = [40.0]               # drawn uniformly; or { range = [40.0, 100.0] }
     n_starts = 6                       # 1: SCP from the relaxed solution alone
     optima = "all"                     # every distinct local optimum; or "best", or "first"
@@ -56,6 +57,8 @@ class Recipe:
             :data:`freeflyer_env.SCENES` that are drawn uniformly.
         n_obstacles: Smallest and largest number of obstacles of a random scene; an int means both.
             None with named scenes.
+        obstacle_speeds: Largest speeds of the obstacles in m/s, one of which is drawn uniformly for
+            each problem; random scenes only. Each obstacle moves uniformly in a random direction.
         final_times: Final times in s, drawn uniformly.
         n_starts: Warm starts that SCP is started from; the first one is the relaxed solution.
         optima: ``"all"`` keeps every distinct local optimum, ``"best"`` the cheapest,
@@ -72,6 +75,7 @@ class Recipe:
     seed: int
     scenes: str | tuple[str, ...] = "random"
     n_obstacles: int | tuple[int, int] | None = None
+    obstacle_speeds: tuple[float, ...] = (0.0,)
     final_times: tuple[float, ...] = (40.0,)
     n_starts: int = 6
     optima: str = "all"
@@ -91,6 +95,7 @@ class Recipe:
         object.__setattr__(self, "scenes", _scenes(self.scenes))
         object.__setattr__(self, "n_obstacles", _obstacle_range(self.n_obstacles, self.scenes))
         object.__setattr__(self, "final_times", _final_times(self.final_times))
+        object.__setattr__(self, "obstacle_speeds", self._checked_speeds())
 
     @property
     def max_obstacles(self) -> int:
@@ -98,6 +103,11 @@ class Recipe:
         if isinstance(self.n_obstacles, tuple):
             return self.n_obstacles[1]
         return max(len(SCENES[name]) for name in self.scenes)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the obstacles of some problems move."""
+        return any(self.obstacle_speeds)
 
     @property
     def fingerprint(self) -> str:
@@ -108,6 +118,8 @@ class Recipe:
         """
         fields = dataclasses.asdict(self)
         del fields["description"], fields["n_problems"]
+        if not self.moving:  # as for recipes from before there were speeds
+            del fields["obstacle_speeds"]
         text = json.dumps(fields, sort_keys=True, separators=(",", ":"))
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -122,11 +134,30 @@ class Recipe:
         if isinstance(self.n_obstacles, tuple):
             low, high = self.n_obstacles
             n_obstacles = int(rng.integers(low, high + 1))
-            return sample_problem(rng, final_time=final_time, n_obstacles=n_obstacles)
+            speed = rng.choice(self.obstacle_speeds) if self.moving else 0.0
+            return sample_problem(
+                rng, final_time=final_time, n_obstacles=n_obstacles, obstacle_speed=speed
+            )
         name = self.scenes[rng.integers(len(self.scenes))]
         rows = np.float32(SCENES[name].rows())
         scenario = replace(Scenario.named(name), obstacles=Obstacles.from_rows(rows))
         return sample_problem(rng, scenario, final_time)
+
+    def _checked_speeds(self) -> tuple[float, ...]:
+        # No observation can tell of an obstacle that is farther off the table than its height.
+        most = Scenario.table[1] / max(self.final_times)
+        speeds = self.obstacle_speeds
+        if not isinstance(speeds, list | tuple) or not speeds:
+            raise ValueError(f"obstacle_speeds must be a list of speeds in m/s, got {speeds!r}.")
+        for speed in speeds:
+            if type(speed) not in (int, float) or not 0.0 <= speed <= most:
+                raise ValueError(
+                    f"obstacle_speeds must be in [0, {most:g}] m/s for final times of up to "
+                    f"{max(self.final_times):g} s, got {speed!r}."
+                )
+        if any(speeds) and self.scenes != "random":
+            raise ValueError("obstacle_speeds is for scenes = 'random' only; remove it.")
+        return tuple(float(speed) for speed in speeds)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as plain values, for JSON; :meth:`from_dict` is its inverse."""
@@ -150,7 +181,7 @@ class Recipe:
         if missing:
             raise ValueError(f"missing key {missing[0]!r}; a recipe needs it.")
         values = dict(data)
-        for key in ("scenes", "n_obstacles", "final_times"):
+        for key in ("scenes", "n_obstacles", "obstacle_speeds", "final_times"):
             if isinstance(values.get(key), list):
                 values[key] = tuple(values[key])
         if isinstance(values.get("final_times"), Mapping):

@@ -40,7 +40,8 @@ class Shard:
         first: Index of the first problem.
         start: ``(P, 6)`` start states.
         goal: ``(P, 6)`` goal states.
-        obstacles: ``(P, M, 3)`` rows (x, y, radius) in m, zero-padded.
+        obstacles: ``(P, M, 3)`` rows (x, y, radius) in m, zero-padded; ``(P, M, 5)`` with
+            velocities (v_x, v_y) in m/s if the recipe's obstacles move.
         final_time: ``(P,)`` in s.
         c_rel: ``(P,)`` nodes of the relaxed trajectory inside a keep-out disc; -1 if it failed.
         rel_cost: ``(P,)`` cost of the relaxed trajectory in m/s; NaN if it failed.

@@ -8,7 +8,8 @@ One group an episode::
       observations
         state                     (N + 1, 6) float32
         goal                      (N + 1, 6) float32
-        obstacles                 (N + 1, M, 3) float32, rows (x, y, radius), zero-padded
+        obstacles                 (N + 1, M, 3) float32, rows (x, y, radius), zero-padded;
+                                  (N + 1, M, 5) with (v_x, v_y) if the recipe's obstacles move
         time_to_go                (N + 1, 1) float32
       actions                     (N, 3) float32, impulses per unit mass (dv_x, dv_y, h)
       rewards                     (N,) float64, -||u||_1
@@ -35,6 +36,7 @@ from freeflyer_datasets.shards import LABEL_SCP, Shard
 from freeflyer_env import dynamics
 from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, keep_out_depth
 from freeflyer_env.scenario import Obstacles, Scenario
+from freeflyer_env.spaces import rows_at
 
 #: Attributes of every episode besides Minari's own ``id`` and ``total_steps``.
 EPISODE_ATTRIBUTES = {
@@ -87,7 +89,7 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
             shard.start[local], controls.astype(np.float64), scenario.dt, scenario.robot
         )
         repeat = n_steps + 1
-        time_to_go = shard.final_time[local] - scenario.dt * np.arange(repeat)[:, None]
+        times = scenario.dt * np.arange(repeat)
         # Every trajectory reaches the goal, so it ends as it does in the environment: terminated.
         last = np.arange(n_steps) == n_steps - 1
         success = shard.label[index] == LABEL_SCP or shard.c_rel[local] == 0
@@ -98,9 +100,9 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
         yield Episode(
             observations={
                 "state": states.astype(np.float32),
-                "goal": _repeated(shard.goal[local], repeat),
-                "obstacles": _repeated(shard.obstacles[local], repeat),
-                "time_to_go": time_to_go.astype(np.float32),
+                "goal": np.repeat(shard.goal[local].astype(np.float32)[None], repeat, axis=0),
+                "obstacles": rows_at(shard.obstacles[local], times),
+                "time_to_go": (shard.final_time[local] - times[:, None]).astype(np.float32),
             },
             actions=controls,
             rewards=-np.abs(controls.astype(np.float64)).sum(axis=1),
@@ -115,10 +117,6 @@ def shard_episodes(shard: Shard, scenario: Scenario | None = None) -> Iterator[E
                 "c_rel": shard.c_rel[local].item(),
             },
         )
-
-
-def _repeated(value: NDArray[np.float64], count: int) -> NDArray[np.float32]:
-    return np.repeat(value.astype(np.float32)[None], count, axis=0)
 
 
 def check_episode(
@@ -159,7 +157,8 @@ def check_episode(
     gap = abs(float(episode.rewards.sum()) + episode.attributes["cost"])
     require(gap <= 1e-9, f"the return differs from minus the cost by {gap:.1e}")
     obstacles = Obstacles.from_rows(episode.observations["obstacles"][0])
-    depth = keep_out_depth(replace(scenario, obstacles=obstacles), exact[:-1, :2])
+    times = scenario.dt * np.arange(n_steps, dtype=np.float64)
+    depth = keep_out_depth(replace(scenario, obstacles=obstacles), exact[:-1, :2], times)
     # Float32 may move a node that touches a disc to its other side.
     least, most = (int((depth > margin).sum()) for margin in (2 * FEASIBILITY_TOLERANCE, 0.0))
     expected = 0 if episode.attributes["label"] == LABEL_SCP else episode.attributes["c_rel"]

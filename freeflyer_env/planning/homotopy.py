@@ -7,6 +7,7 @@ enumerate it, deterministically, instead of adding noise.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from freeflyer_env.constraints import keep_out_depth
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
-from freeflyer_env.scenario import Problem, Scenario
+from freeflyer_env.scenario import Obstacles, Problem, Scenario
 
 _SAMPLES = 81  # points of a candidate path
 _TORN = 4.0  # a gap of so many times the mean distance of a path's points
@@ -30,9 +31,12 @@ def homotopy_starts(problem: Problem, n_starts: int) -> list[Trajectory]:
     shortest of each class is kept. Where a gap is narrower than the robot, pushing out tears the
     path or leaves it in a disc: such paths come last.
 
+    A moving obstacle is taken where uniform motion along the straight line passes it.
+
     Returns:
         At most ``n_starts`` warm starts with zero controls; deterministic.
     """
+    problem = _halted(problem)
     paths = np.concatenate([_bent_paths(problem), _grid_paths(problem)])
     paths = push_out(problem.scenario, paths, rounds=5)
     steps = np.linalg.norm(np.diff(paths, axis=1), axis=2)
@@ -61,27 +65,57 @@ def warm_start_along(problem: Problem, path: FloatArray) -> Trajectory:
 
 
 def push_out(
-    scenario: Scenario, positions: FloatArray, margin: float = 0.005, rounds: int = 8
+    scenario: Scenario,
+    positions: FloatArray,
+    margin: float = 0.005,
+    rounds: int = 8,
+    times: FloatArray | float = 0.0,
 ) -> FloatArray:
     """Moves positions ``(..., 2)`` radially out of the keep-out discs and onto the table.
 
     Where discs overlap or touch the wall, ``rounds`` of alternating projections may not suffice.
+
+    Args:
+        scenario: Gives table, robot and obstacles.
+        positions: Of the robot's centre in m.
+        margin: Distance in m from the discs at which they end up.
+        rounds: Most rounds.
+        times: When, in s, to broadcast with ``(...)``; matters only if obstacles move.
     """
     positions = np.array(positions, dtype=np.float64)
     low, high = scenario.position_limits
+    obstacles = scenario.obstacles
+    centres = obstacles.centres_at(times) if obstacles.moving else obstacles.centres
     for _ in range(rounds):
         before = positions.copy()
-        for centre, radius in zip(scenario.obstacles.centres, scenario.keep_out_radii):
-            x, y = positions[..., 0] - centre[0], positions[..., 1] - centre[1]
-            distance = np.sqrt(x * x + y * y)
+        for index, radius in enumerate(scenario.keep_out_radii):
+            centre = np.broadcast_to(centres[..., index, :], positions.shape)
+            offset = positions - centre
+            distance = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
             inside = distance < radius + margin
             stretch = (radius + margin) / np.maximum(distance[inside], 1e-9)
-            positions[inside, 0] = centre[0] + x[inside] * stretch
-            positions[inside, 1] = centre[1] + y[inside] * stretch
+            positions[inside] = centre[inside] + offset[inside] * stretch[:, None]
         np.clip(positions, low, high, out=positions)
         if np.abs(before - positions).max(initial=0.0) <= 1e-9:
             break
     return positions
+
+
+def _halted(problem: Problem) -> Problem:
+    """The problem with its moving obstacles at rest where the straight line passes them."""
+    scenario = problem.scenario
+    obstacles = scenario.obstacles
+    if not obstacles.moving:
+        return problem
+    start, way = problem.start[:2], problem.goal[:2] - problem.start[:2]
+    span = max(float(way @ way), 1e-12)
+    every, centres = np.arange(len(obstacles)), obstacles.centres
+    for _ in range(4):  # the place depends on the time, and the time on the place
+        share = np.clip((centres - start) @ way / span, 0.0, 1.0)
+        centres = obstacles.centres_at(share * problem.final_time)[every, every]
+    return replace(
+        problem, scenario=replace(scenario, obstacles=Obstacles(centres, obstacles.radii))
+    )
 
 
 def _bent_paths(problem: Problem) -> FloatArray:

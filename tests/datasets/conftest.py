@@ -17,13 +17,15 @@ GENERATE_MODULE = importlib.import_module("freeflyer_datasets.generate")
 
 @pytest.fixture(scope="session")
 def recipe() -> Recipe:
-    """Random scenes with a varying number of obstacles, two final times, two starts."""
+    """Random scenes with a varying number of obstacles, two final times, two starts; some
+    obstacles move."""
     return Recipe(
         id="freeflyer/tiny-v0",
         description="A tiny dataset.",
         n_problems=10,
         seed=12,
         n_obstacles=(2, 4),
+        obstacle_speeds=(0.0, 0.02),
         final_times=(30.0, 40.0),
         n_starts=2,
     )

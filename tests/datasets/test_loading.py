@@ -32,7 +32,7 @@ def packed(shards: Path, tmp_path: Path) -> PackedDataset:
 def test_contents_are_those_of_the_shards(packed: PackedDataset, shards: Path, recipe: Recipe):
     assert packed.n_problems == recipe.n_problems
     assert packed.dataset_id == recipe.id
-    assert packed.obstacles.shape == (recipe.n_problems, recipe.max_obstacles, 3)
+    assert packed.obstacles.shape == (recipe.n_problems, recipe.max_obstacles, 5)  # some move
     assert packed.controls.dtype == np.float32
     row = 0
     for shard in iterate_shards(shards):

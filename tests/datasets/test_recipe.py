@@ -73,6 +73,17 @@ def test_problems_cover_the_recipe_and_are_exact_in_float32():
             np.testing.assert_array_equal(value, np.float32(value).astype(float))
 
 
+def test_obstacles_move_in_the_share_of_the_problems_that_the_recipe_asks_for():
+    recipe = Recipe(**GOOD, obstacle_speeds=(0.0, 0.0, 0.0, 0.02))
+    moving = [recipe.problem(index).scenario.obstacles for index in range(200)]
+    speeds = [np.linalg.norm(obstacles.velocities, axis=1) for obstacles in moving]
+    assert 30 <= sum(obstacles.moving for obstacles in moving) <= 70
+    assert 0.015 < np.max(speeds) <= 0.02
+    still = Recipe(**GOOD)
+    assert still.fingerprint != recipe.fingerprint
+    assert still.problem(3).to_dict() == Recipe(**GOOD, obstacle_speeds=(0.0,)).problem(3).to_dict()
+
+
 def test_fingerprint_ignores_what_problems_do_not_depend_on():
     base = Recipe(**GOOD)
     assert Recipe(**{**GOOD, "n_problems": 9, "description": "Else."}).fingerprint == (
@@ -92,6 +103,9 @@ def test_fingerprint_ignores_what_problems_do_not_depend_on():
         ({"seed": -1}, r"seed must be .*\[0, .*got -1"),
         ({"seed": True}, "seed must be a whole number"),
         ({"n_starts": 0}, r"n_starts must be .*\[1, 64\].*got 0"),
+        ({"obstacle_speeds": 0.1}, "must be a list of speeds in m/s, got 0.1"),
+        ({"obstacle_speeds": [0.0, 0.1]}, r"in \[0, 0.0625\] m/s for final times of up to 40 s"),
+        ({"obstacle_speeds": [0.05], "scenes": ["nominal"]}, "for scenes = 'random' only"),
         ({"optima": "some"}, "optima must be one of .*, got 'some'"),
         ({"scenes": ["nominl"]}, "Did you mean 'nominal'"),
         ({"scenes": []}, "scenes must be"),
