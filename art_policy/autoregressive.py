@@ -126,7 +126,7 @@ class Autoregressive(nn.Module):
             self.performance_encoder(
                 self._performance_features(problems, states, budget, time_to_go)
             ),
-            self._embed_scene(problems, states),
+            self._embed_scene(problems, states, time_to_go),
         ]
         if self.config.tokens_per_step == 2:
             parts = [torch.stack(parts).sum(0)]
@@ -187,14 +187,14 @@ class Autoregressive(nn.Module):
             dim=-1,
         )
 
-    def _embed_scene(self, problems: ProblemBatch, states: Tensor) -> Tensor:
+    def _embed_scene(self, problems: ProblemBatch, states: Tensor, time_to_go: Tensor) -> Tensor:
         """``(B, L, width)``: the sum over the discs, whose order therefore does not matter."""
-        discs = problems.discs[:, None]  # (B, 1, M, 3)
+        discs = problems.discs_at(problems.final_time[:, None] - time_to_go)  # (B, L, M, 3)
         offset = states[:, :, None, :2] - discs[..., :2]  # (B, L, M, 2)
         clearance = offset.norm(dim=3, keepdim=True) - discs[..., 2:]
         features = torch.cat([offset, clearance], dim=3)
         if self.config.scene_descriptors == "absolute":
-            features = discs.expand(-1, states.shape[1], -1, -1)
+            features = discs
         return (self.disc_encoder(features) * problems.present[:, None, :, None]).sum(2)
 
 

@@ -44,9 +44,10 @@ class _Plain(nn.Module):
 def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
     """Writes a multi-hypothesis model as ONNX.
 
-    Inputs are ``start`` and ``goal`` ``(B, 6)``, ``discs`` ``(B, M, 3)`` with rows ``(x, y,
-    keep-out radius)``, radius zero for padding, and ``final_time`` ``(B,)``, float32 in SI units;
-    outputs are ``knots`` ``(B, H, n_knots, 3)`` and ``scores`` ``(B, H)``. Any ``B`` and ``M`` do.
+    Inputs are ``start`` and ``goal`` ``(B, 6)``, ``discs`` ``(B, M, 5)`` with rows ``(x, y,
+    keep-out radius, v_x, v_y)``, radius zero for padding, and ``final_time`` ``(B,)``, float32 in
+    SI units; outputs are ``knots`` ``(B, H, n_knots, 3)`` and ``scores`` ``(B, H)``. Any ``B`` and
+    ``M`` do.
 
     Args:
         model: What to export.
@@ -73,7 +74,12 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
     example = (
         torch.tensor([[0.3, 1.0, 0.1, 0.0, 0.0, 0.0], [0.2, 2.0, 1.0, 0.0, 0.0, 0.0]]),
         torch.tensor([[3.2, 1.5, 0.5, 0.0, 0.0, 0.0], [3.3, 0.5, 2.0, 0.0, 0.0, 0.0]]),
-        torch.tensor([[[1.0, 1.0, 0.3], [2.0, 1.2, 0.4], [0.0] * 3], [[1.5, 1.0, 0.3]] * 3]),
+        torch.tensor(
+            [
+                [[1.0, 1.0, 0.3, 0.0, 0.01], [2.0, 1.2, 0.4, 0.0, 0.0], [0.0] * 5],
+                [[1.5, 1.0, 0.3, 0.01, 0.0]] * 3,
+            ]
+        ),
         torch.tensor([40.0, 60.0]),
     )
     batch, count = torch.export.Dim("batch"), torch.export.Dim("discs")
@@ -165,6 +171,6 @@ class OnnxART:
         """As :meth:`MultiHypothesis.forward`."""
         inputs = {name: getattr(problems, name).numpy() for name in _INPUTS}
         if not inputs["discs"].shape[1]:
-            inputs["discs"] = np.zeros((len(problems), 1, 3), dtype=np.float32)
+            inputs["discs"] = np.zeros((len(problems), 1, 5), dtype=np.float32)
         knots, scores = self._session.run(list(_OUTPUTS), inputs)
         return torch.from_numpy(knots), torch.from_numpy(scores)

@@ -24,8 +24,10 @@ from torch.nn import functional as F
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, initialise
 from art_policy.sequence import ProblemBatch, random_flags
 
-_N_PROBLEM_FEATURES = 14
-_N_DISC_FEATURES = 12
+_N_PROBLEM_FEATURES = 20
+_N_DISC_FEATURES = 14
+_RATE_SCALE = (10.0, 10.0, 5.0)  # s/m, s/m, s/rad
+_SHORTEST = 5.0  # s: shorter final times are described as this one
 _POSE_SCALE = (0.25, 0.25, 0.5)  # m, m, rad: size of a typical deviation
 _ROBOT_RADIUS = 0.15  # m: half the width of the gap that lets the robot pass
 
@@ -62,11 +64,13 @@ class HypothesisBatch:
             self.problems.to(device), self.paths.to(device), self.costs.to(device)
         )
 
-    def augmented(self, table: tuple[float, float], generator: torch.Generator) -> HypothesisBatch:
+    def augmented(
+        self, table: tuple[float, float], dt: float, generator: torch.Generator
+    ) -> HypothesisBatch:
         """Each example under a random one of the four symmetries of mirror and time reversal."""
         batch = len(self.problems)
         mirror, reverse = random_flags(batch, generator), random_flags(batch, generator)
-        problems = self.problems.mirrored(mirror, table[1]).reversed(reverse, table[0])
+        problems = self.problems.mirrored(mirror, table[1]).reversed(reverse, table[0], dt)
         flip = self.paths.new_tensor([1.0, -1.0, -1.0])
         paths = torch.where(mirror[:, None, None, None], self.paths * flip, self.paths)
         flip = self.paths.new_tensor([-1.0, 1.0, -1.0])
@@ -217,11 +221,13 @@ def _padding_mask(problems: ProblemBatch, n_others: int) -> Tensor | None:
 
 
 def problem_features(problems: ProblemBatch, table: tuple[float, float]) -> Tensor:
-    """``(B, 14)`` scaled description of start, goal and final time (both ends at rest)."""
+    """``(B, 20)`` scaled description of start, goal and final time."""
     size = problems.start.new_tensor(table)
     start, goal = problems.start[:, :3], problems.goal[:, :3]
     way = goal[:, :2] - start[:, :2]
     span = way.norm(dim=1, keepdim=True).clamp(min=1e-6)
+    final_time = problems.final_time[:, None].clamp(min=_SHORTEST)
+    rate_scale = problems.start.new_tensor(_RATE_SCALE)
     headings = 4.0 * torch.stack([start[:, 2], goal[:, 2]], dim=1)  # quarter turns drop out
     return torch.cat(
         [
@@ -230,22 +236,31 @@ def problem_features(problems: ProblemBatch, table: tuple[float, float]) -> Tens
             headings.cos(),
             headings.sin(),
             (goal[:, 2:] - start[:, 2:]) / math.pi,
-            (problems.final_time[:, None] / 40.0).log(),
-            40.0 / problems.final_time[:, None],
+            (final_time / 40.0).log(),
+            40.0 / final_time,
             span / size[0],
             way / span,
+            problems.start[:, 3:] * rate_scale,
+            problems.goal[:, 3:] * rate_scale,
         ],
         dim=1,
     )
 
 
 def disc_features(problems: ProblemBatch, table: tuple[float, float]) -> Tensor:
-    """``(B, M, 12)`` scaled description of each disc, on the table and relative to the way."""
+    """``(B, M, 14)`` scaled description of each disc, on the table and relative to the way.
+
+    A moving disc is described where uniform motion along the way would pass it.
+    """
     size = problems.start.new_tensor(table)
-    centre, radius = problems.discs[..., :2], problems.discs[..., 2:]
+    radius, velocity = problems.discs[..., 2:3], problems.discs[..., 3:]
     start, goal = problems.start[:, None, :2], problems.goal[:, None, :2]
     span = (goal - start).norm(dim=2, keepdim=True).clamp(min=1e-6)
     along = (goal - start) / span
+    time = problems.final_time[:, None, None]
+    closing = (span - time * (velocity * along).sum(2, keepdim=True)).clamp(min=1e-3)
+    ahead = ((problems.discs[..., :2] - start) * along).sum(2, keepdim=True)
+    centre = problems.discs[..., :2] + velocity * time * (ahead / closing).clamp(0.0, 1.0)
     offset = centre - start
     progress = (offset * along).sum(2, keepdim=True)
     side = along[..., :1] * offset[..., 1:] - along[..., 1:] * offset[..., :1]  # left positive
@@ -263,6 +278,8 @@ def disc_features(problems: ProblemBatch, table: tuple[float, float]) -> Tensor:
             2.0 * (centre[..., 1:] - radius - low),
             2.0 * (high - centre[..., 1:] - radius),
             (radius - side.abs()).clamp(min=0.0) * 4.0,
+            40.0 * (velocity * along).sum(2, keepdim=True),
+            40.0 * (along[..., :1] * velocity[..., 1:] - along[..., 1:] * velocity[..., :1]),
         ],
         dim=2,
     )

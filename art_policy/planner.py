@@ -216,7 +216,8 @@ def distrust(problem: Problem, warm_start: Trajectory) -> str | None:
     miss = float(np.abs(warm_start.states[0, :3] - problem.start[:3]).max())
     if miss > 1e-3:
         return f"it starts {miss:.3f} away from the start"
-    depth = float(keep_out_depth(problem.scenario, warm_start.states[:, :2]).max())
+    nodes, times = warm_start.states[:-1, :2], problem.node_times[:-1]
+    depth = float(keep_out_depth(problem.scenario, nodes, times).max())
     if depth > _DEEPEST_WARM_START:
         return f"it passes {depth:.3f} m deep through a keep-out disc"
     return None

@@ -116,7 +116,8 @@ def decode_poses(problem: Problem, knots: FloatArray) -> FloatArray:
     share = np.linspace(0.0, 1.0, problem.n_steps)[:, None]
     line = (1.0 - share) * problem.start[:3] + share * problem.goal[:3]
     poses = line + matrix @ knots.astype(np.float64)  # (N, 3) + (H, N, 3)
-    poses[..., :2] = push_out(problem.scenario, poses[..., :2])
+    times = problem.node_times[:-1]
+    poses[..., :2] = push_out(problem.scenario, poses[..., :2], times=times)
     poses[:, 0], poses[:, -1] = problem.start[:3], problem.goal[:3]
     return poses
 

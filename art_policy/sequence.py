@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from freeflyer_env.robot import Robot
-from freeflyer_env.scenario import Problem
+from freeflyer_env.scenario import Problem, Scenario
 
 #: What mirroring in x or in y does to the signs of a state and of a control.
 MIRROR_STATE = ((-1.0, 1.0, -1.0, -1.0, 1.0, -1.0), (1.0, -1.0, -1.0, 1.0, -1.0, -1.0))
@@ -34,7 +34,8 @@ class ProblemBatch:
     Attributes:
         start: ``(B, 6)`` states at time zero, SI.
         goal: ``(B, 6)`` goal states.
-        discs: ``(B, M, 3)`` rows ``(x, y, keep-out radius)`` in m; radius zero is padding.
+        discs: ``(B, M, 5)`` rows ``(x, y, keep-out radius, v_x, v_y)`` at time zero in m and m/s;
+            radius zero is padding.
         final_time: ``(B,)`` in s.
     """
 
@@ -53,13 +54,20 @@ class ProblemBatch:
 
     @classmethod
     def from_problems(cls, problems: Sequence[Problem]) -> ProblemBatch:
-        """Stacks problems; the number of obstacles may differ."""
+        """Stacks problems; the number of obstacles may differ.
+
+        An obstacle that moves along waypoints is taken to move uniformly from where it is at time
+        zero to where it is at the final time.
+        """
         most = max((len(problem.scenario.obstacles) for problem in problems), default=0)
-        discs = np.zeros((len(problems), most, 3), dtype=np.float32)
+        discs = np.zeros((len(problems), most, 5), dtype=np.float32)
         for row, problem in zip(discs, problems):
-            scenario = problem.scenario
-            row[: len(scenario.obstacles), :2] = scenario.obstacles.centres
-            row[: len(scenario.obstacles), 2] = scenario.keep_out_radii
+            obstacles = problem.scenario.obstacles
+            row[: len(obstacles), :2] = obstacles.centres
+            row[: len(obstacles), 2] = problem.scenario.keep_out_radii
+            if obstacles.moving:
+                way = obstacles.centres_at(problem.final_time) - obstacles.centres
+                row[: len(obstacles), 3:] = way / problem.final_time
         numbers = np.array(
             [(*problem.start, *problem.goal, problem.final_time) for problem in problems],
             dtype=np.float32,
@@ -69,6 +77,12 @@ class ProblemBatch:
 
     def __getitem__(self, index: Tensor) -> ProblemBatch:
         return ProblemBatch(*(getattr(self, item.name)[index] for item in fields(self)))
+
+    def discs_at(self, times: Tensor) -> Tensor:
+        """Rows ``(B, L, M, 3)``, ``(x, y, keep-out radius)``, at times ``(B, L)`` in s."""
+        centres = self.discs[:, None, :, :2] + times[:, :, None, None] * self.discs[:, None, :, 3:]
+        radius = self.discs[:, None, :, 2:3].expand(-1, times.shape[1], -1, -1)
+        return torch.cat([centres, radius], dim=3)
 
     def to(self, device: torch.device | str) -> ProblemBatch:
         """The same on another device."""
@@ -82,25 +96,35 @@ class ProblemBatch:
             size: Size of the table along ``axis`` in m.
             axis: The coordinate that changes sign: 0 for x, 1 for y.
         """
-        return self._mapped(which, self.start, self.goal, MIRROR_STATE[axis], size, axis)
+        ends = self.start, self.goal, self.discs
+        return self._mapped(which, ends, MIRROR_STATE[axis], size, axis)
 
-    def reversed(self, which: Tensor, size: float) -> ProblemBatch:
-        """Reverses time and mirrors in x, so that the start stays on the left, where ``which``."""
-        return self._mapped(which, self.goal, self.start, REVERSE_STATE, size, 0)
+    def reversed(self, which: Tensor, size: float, dt: float = Scenario.dt) -> ProblemBatch:
+        """Reverses time and mirrors in x, so that the start stays on the left, where ``which``.
+
+        Args:
+            which: Where to reverse.
+            size: Size of the table along x in m.
+            dt: Step in s; the last impulse acts one step before the final time.
+        """
+        centres = self.discs_at(self.final_time[:, None] - dt)[:, 0]
+        discs = torch.cat([centres, -self.discs[..., 3:]], dim=2)
+        return self._mapped(which, (self.goal, self.start, discs), REVERSE_STATE, size, 0)
 
     def _mapped(
         self,
         which: Tensor,
-        start: Tensor,
-        goal: Tensor,
+        ends: tuple[Tensor, Tensor, Tensor],
         signs: tuple[float, ...],
         size: float,
         axis: int,
     ) -> ProblemBatch:
+        start, goal, discs = ends
         sign, shift = start.new_tensor(signs), start.new_zeros(6)
         shift[axis] = size
-        discs = self.discs.clone()
+        discs = discs.clone()
         discs[..., axis] = size - discs[..., axis]
+        discs[..., 3 + axis] = -discs[..., 3 + axis]
         return ProblemBatch(
             torch.where(which[:, None], start * sign + shift, self.start),
             torch.where(which[:, None], goal * sign + shift, self.goal),
@@ -171,7 +195,8 @@ class SequenceBatch:
         rates = torch.cat([problems.start[:, None, 3:], after[:, :-1]], dim=1)
         step = torch.arange(controls.shape[1], device=controls.device)
         valid = step < n_steps[:, None]
-        inside = keep_out_depth(problems.discs, poses[..., :2]) > KEEP_OUT_TOLERANCE
+        times = (dt * step).expand(valid.shape)
+        inside = keep_out_depth(problems.discs_at(times), poses[..., :2]) > KEEP_OUT_TOLERANCE
         return cls(
             problems,
             torch.cat([poses, rates], dim=2),
@@ -200,15 +225,15 @@ KEEP_OUT_TOLERANCE = 1e-4
 
 
 def keep_out_depth(discs: Tensor, positions: Tensor) -> Tensor:
-    """How deep positions ``(B, L, 2)`` are inside the discs ``(B, M, 3)``, ``(B, L)`` in m.
+    """How deep positions ``(B, L, 2)`` are inside the discs ``(B, L, M, 3)``, ``(B, L)`` in m.
 
     As :func:`freeflyer_env.constraints.keep_out_depth`, for a scene per row; padding is ignored.
     """
-    if not discs.shape[1]:
+    if not discs.shape[2]:
         return torch.full_like(positions[..., 0], -torch.inf)
-    gaps = (positions[:, :, None] - discs[:, None, :, :2]).norm(dim=3)  # (B, L, M)
-    depth = discs[:, None, :, 2] - gaps
-    return depth.masked_fill(discs[:, None, :, 2] <= 0.0, -torch.inf).amax(2)
+    gaps = (positions[:, :, None] - discs[..., :2]).norm(dim=3)  # (B, L, M)
+    depth = discs[..., 2] - gaps
+    return depth.masked_fill(discs[..., 2] <= 0.0, -torch.inf).amax(2)
 
 
 def reverse_controls(controls: Tensor, n_steps: Tensor) -> Tensor:

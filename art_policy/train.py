@@ -55,6 +55,10 @@ class TrainConfig:
         gradient_clip: Largest norm of the gradient.
         ema_decay: Decay of the running average of the weights, which is what is saved.
         augment: Whether examples are put under random symmetries of the problem.
+        tails: Multi-hypothesis only: whether for every problem one is added that begins in flight,
+            for re-planning.
+        init: Model whose weights training begins with, as :meth:`ART.from_pretrained` takes it;
+            None for random ones.
         validation_fraction: Share of the problems that are held out.
         log_every: Steps between lines of the log.
         validate_every: Steps between validations.
@@ -76,6 +80,8 @@ class TrainConfig:
     gradient_clip: float = 1.0
     ema_decay: float = 0.999
     augment: bool = True
+    tails: bool = True
+    init: str | None = None
     validation_fraction: float = 0.05
     log_every: int = 50
     validate_every: int = 500
@@ -134,6 +140,8 @@ class _State:
     def create(cls, model_config: ARTConfig, config: TrainConfig, data: dict[str, Any]) -> _State:
         torch.manual_seed(config.seed)
         model = ART(model_config).to(config.device)
+        if config.init is not None:
+            model.load_state_dict(_initial(config.init, model_config).state_dict())
         matrices = [p for p in model.parameters() if p.dim() >= 2]
         vectors = [p for p in model.parameters() if p.dim() < 2]
         groups = [
@@ -250,9 +258,9 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     if config.threads:
         torch.set_num_threads(config.threads)
-    training, validation = (
-        _examples(dataset, part, model_config) for part in dataset.split(config.validation_fraction)
-    )
+    parts = dataset.split(config.validation_fraction)
+    training = _examples(dataset, parts[0], model_config, config.tails)
+    validation = _examples(dataset, parts[1], model_config)
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
     data = {"dataset": dataset.dataset_id, "examples": len(training)}
@@ -307,10 +315,23 @@ def _loop(
         logger.warning("Interrupted at step %d; saving.", state.step)
 
 
-def _examples(dataset: PackedDataset, trajectories: np.ndarray, config: ARTConfig) -> ExampleSet:
+def _examples(
+    dataset: PackedDataset, trajectories: np.ndarray, config: ARTConfig, tails: bool = False
+) -> ExampleSet:
     if config.head == "autoregressive":
         return SequenceSet(dataset, trajectories, config.table, config.context_length)
-    return HypothesisSet(dataset, trajectories, config.table)
+    return HypothesisSet(dataset, trajectories, config.table, tails)
+
+
+def _initial(name: str, config: ARTConfig) -> ART:
+    model = ART.from_pretrained(name)
+    ours, theirs = config.to_dict(), model.config.to_dict()
+    if changed := [key for key in ours if ours[key] != theirs[key]]:
+        raise ValueError(
+            f"TrainConfig.init: {name!r} is of another {', '.join(changed)} than the model that is "
+            "to be trained."
+        )
+    return model
 
 
 def _batch_size(training: ExampleSet, config: TrainConfig) -> int:

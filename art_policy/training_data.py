@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +35,8 @@ class HypothesisSet:
         dataset: Source; problems without a solved trajectory are left out.
         trajectories: Indices of the trajectories to use.
         table: Size of the table in m, for augmentation.
+        tails: Whether to add one problem that begins in flight for each problem: what is left of
+            one of its optima from a random node on, which is an optimum of what is left.
         n_samples: Number ``S`` of equally spaced times at which a path is compared.
         max_optima: Most optima ``R`` of one problem that are used, cheapest first.
     """
@@ -43,6 +46,7 @@ class HypothesisSet:
         dataset: PackedDataset,
         trajectories: np.ndarray,
         table: tuple[float, float],
+        tails: bool = False,
         n_samples: int = 64,
         max_optima: int = 4,
     ) -> None:
@@ -59,18 +63,72 @@ class HypothesisSet:
         costs[slot, rank[chosen]] = dataset.cost[chosen]
         # Without its cheapest optimum (beyond the chosen ranks, say) a problem teaches nothing.
         usable = np.isfinite(costs[:, 0])
-        self._problems = problem_batch(dataset, problems[usable])
-        self._paths = torch.from_numpy(paths[usable])
-        self._costs = torch.from_numpy(costs[usable])
-        self._table = table
+        batch = HypothesisBatch(
+            problem_batch(dataset, problems[usable]),
+            torch.from_numpy(paths[usable]),
+            torch.from_numpy(costs[usable]),
+        )
+        if tails:
+            batch = _joined(batch, _tails(dataset, chosen, n_optima, n_samples))
+        self._examples, self._table, self._dt = batch, table, dataset.dt
 
     def __len__(self) -> int:
-        return len(self._problems)
+        return len(self._examples)
 
     def batch(self, index: Tensor, generator: torch.Generator | None) -> HypothesisBatch:
         """The examples ``index``, each under a random symmetry if a ``generator`` is given."""
-        examples = HypothesisBatch(self._problems[index], self._paths[index], self._costs[index])
-        return examples.augmented(self._table, generator) if generator else examples
+        every = self._examples
+        examples = HypothesisBatch(every.problems[index], every.paths[index], every.costs[index])
+        return examples.augmented(self._table, self._dt, generator) if generator else examples
+
+
+#: Fewest steps that are left of a trajectory in a problem that begins in flight.
+_SHORTEST_TAIL = 10
+
+
+def _tails(
+    dataset: PackedDataset, trajectories: np.ndarray, n_optima: int, n_samples: int
+) -> HypothesisBatch:
+    """What is left of one optimum of each problem from a random node on; seeded."""
+    rng = np.random.default_rng(0)
+    order = rng.permutation(trajectories)
+    _, first = np.unique(np.asarray(dataset.problem_index)[order], return_index=True)
+    chosen = order[first]
+    n_steps = np.diff(dataset.offsets)[chosen]
+    begin = rng.integers(1, np.maximum(n_steps - _SHORTEST_TAIL, 2))
+    paths = np.zeros((len(chosen), n_optima, n_samples, 3), dtype=np.float32)
+    costs = np.full((len(chosen), n_optima), np.inf, dtype=np.float32)
+    start = np.zeros((len(chosen), 6), dtype=np.float32)
+    for part, states in rollouts(dataset, chosen):
+        for row, whole in zip(part, states):
+            left = whole[begin[row] : -1, :3]
+            paths[row, 0] = deviations(left[None], n_samples)[0]
+            start[row] = whole[begin[row]]
+            controls = dataset.controls_of([chosen[row]])[0]
+            costs[row, 0] = np.abs(controls[begin[row] :]).sum()
+    whole_problems = problem_batch(dataset, np.asarray(dataset.problem_index)[chosen])
+    passed = torch.from_numpy((dataset.dt * begin).astype(np.float32))
+    discs = whole_problems.discs.clone()
+    discs[..., :3] = whole_problems.discs_at(passed[:, None])[:, 0]
+    goal, final_time = whole_problems.goal, whole_problems.final_time - passed
+    problems = ProblemBatch(torch.from_numpy(start), goal, discs, final_time)
+    # Where nothing is left to pay for, no optimum is better than another.
+    usable = torch.from_numpy(costs[:, 0] > 0.0)
+    return HypothesisBatch(
+        problems[usable], torch.from_numpy(paths)[usable], torch.from_numpy(costs)[usable]
+    )
+
+
+def _joined(first: HypothesisBatch, second: HypothesisBatch) -> HypothesisBatch:
+    problems = (
+        torch.cat([getattr(first.problems, item.name), getattr(second.problems, item.name)])
+        for item in fields(ProblemBatch)
+    )
+    return HypothesisBatch(
+        ProblemBatch(*problems),
+        torch.cat([first.paths, second.paths]),
+        torch.cat([first.costs, second.costs]),
+    )
 
 
 class SequenceSet:
@@ -112,7 +170,7 @@ class SequenceSet:
         if generator:
             mirror, reverse = (random_flags(len(index), generator) for _ in range(2))
             problems = problems.mirrored(mirror, self._table[1])
-            problems = problems.reversed(reverse, self._table[0])
+            problems = problems.reversed(reverse, self._table[0], self._dt)
             flip = controls.new_tensor(MIRROR_CONTROL[1])
             controls = torch.where(mirror[:, None, None], controls * flip, controls)
             flipped = reverse_controls(controls, n_steps)
@@ -129,7 +187,9 @@ class SequenceSet:
 def problem_batch(dataset: PackedDataset, problems: np.ndarray) -> ProblemBatch:
     """The problems of these indices, with keep-out radii in place of radii."""
     scenario = Scenario()
-    rows = np.array(dataset.obstacles[problems], dtype=np.float64)
+    table = np.asarray(dataset.obstacles[problems], dtype=np.float64)
+    rows = np.zeros((*table.shape[:2], 5))
+    rows[..., : table.shape[2]] = table
     radius = (rows[..., 2] + scenario.robot.radius) * scenario.keep_out_factor
     rows[..., 2] = np.where(rows[..., 2] > 0.0, radius, 0.0)
     columns = (dataset.start[problems], dataset.goal[problems], rows, dataset.final_time[problems])

@@ -17,7 +17,7 @@ def one_thread() -> None:
 
 @pytest.fixture(scope="session")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> PackedDataset:
-    """Random scenes with two to four obstacles and two final times."""
+    """Random scenes with two to four obstacles, some moving, and two final times."""
     folder = tmp_path_factory.mktemp("shards")
     recipe = Recipe(
         id="freeflyer/tiny-v0",
@@ -25,6 +25,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> PackedDataset:
         n_problems=24,
         seed=7,
         n_obstacles=(2, 4),
+        obstacle_speeds=(0.0, 0.02),
         final_times=(30.0, 40.0),
         n_starts=3,
     )

@@ -23,7 +23,7 @@ from art_policy.training_data import HypothesisSet, SequenceSet, deviations
 from freeflyer_datasets.loading import PackedDataset
 from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 from freeflyer_env import constraints
-from freeflyer_env.planning import Trajectory, to_go
+from freeflyer_env.planning import Trajectory, solve_scp, to_go
 from freeflyer_env.scenario import Obstacles, Problem, Scenario
 
 LENGTH, WIDTH = Scenario().table
@@ -114,6 +114,26 @@ def test_augmented_paths_are_those_of_the_augmented_problems(dataset: PackedData
         np.testing.assert_allclose(batch.problems.start[row], problem.start[0], atol=1e-6)
 
 
+def test_tails_are_solved_problems_that_begin_in_flight(dataset: PackedDataset) -> None:
+    every = np.arange(len(dataset))
+    without = HypothesisSet(dataset, every, (LENGTH, WIDTH))
+    training = HypothesisSet(dataset, every, (LENGTH, WIDTH), tails=True)
+    assert len(training) == 2 * len(without)
+    tails = training.batch(torch.arange(len(without), len(training)), None)
+    assert (tails.problems.start[:, 3:].norm(dim=1) > 0.0).all()
+    assert tails.costs[:, 0].isfinite().all()
+    for row in range(0, len(tails), 3):
+        problem = to_problem(tails.problems[torch.tensor([row])])
+        knots = tails.paths[row].numpy()[0]
+        share = np.linspace(0.0, 1.0, problem.n_steps)
+        at = np.linspace(0.0, 1.0, len(knots))
+        away = np.column_stack([np.interp(share, at, knots[:, axis]) for axis in range(3)])
+        line = problem.start[:3] + share[:, None] * (problem.goal[:3] - problem.start[:3])
+        result = solve_scp(problem, Trajectory.from_poses(problem, line + away))
+        assert result.solved
+        assert result.cost == pytest.approx(float(tails.costs[row, 0]), rel=0.02, abs=1e-4)
+
+
 def test_hypothesis_set_holds_the_optima_cheapest_first(dataset: PackedDataset) -> None:
     training = HypothesisSet(dataset, np.arange(len(dataset)), (LENGTH, WIDTH))
     costs = training.batch(torch.arange(len(training)), None).costs
@@ -164,12 +184,13 @@ def test_windows_are_parts_of_the_trajectory(dataset: PackedDataset) -> None:
 
 def test_keep_out_depth_agrees_with_the_constraint_check(dataset: PackedDataset) -> None:
     problems = [dataset.problem(i) for i in range(8)]
-    positions = np.random.default_rng(0).uniform((0.0, 0.0), (3.5, 2.5), (8, 50, 2))
-    depth = keep_out_depth(
-        double(ProblemBatch.from_problems(problems)).discs, torch.tensor(positions)
-    )
+    assert any(problem.scenario.obstacles.moving for problem in problems)
+    rng = np.random.default_rng(0)
+    positions, times = rng.uniform((0.0, 0.0), (3.5, 2.5), (8, 50, 2)), rng.uniform(0, 40, (8, 50))
+    discs = double(ProblemBatch.from_problems(problems)).discs_at(torch.tensor(times))
+    depth = keep_out_depth(discs, torch.tensor(positions))
     for row, problem in zip(range(8), problems):
-        expected = constraints.keep_out_depth(problem.scenario, positions[row])
+        expected = constraints.keep_out_depth(problem.scenario, positions[row], times[row])
         np.testing.assert_allclose(depth[row], expected, atol=1e-6)
 
 

@@ -63,8 +63,9 @@ def test_resuming_changes_nothing(
 
 def test_hypotheses_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) -> None:
     model = replace(TINY, width=64, dropout=0.0)
-    config = replace(SHORT, max_steps=250, batch_size=24, learning_rate=3e-3, ema_decay=0.9,
-                     augment=False, log_every=10, validate_every=1000)  # fmt: skip
+    config = replace(SHORT, max_steps=400, batch_size=24, learning_rate=3e-3, ema_decay=0.9,
+                     augment=False, tails=False, log_every=10,
+                     validate_every=1000)  # fmt: skip
     train(dataset, model, config, tmp_path)
     rows = [row for row in log_of(tmp_path) if "lr" in row]
     assert rows[-1]["distance"] < 0.03
@@ -133,3 +134,15 @@ def test_autocast_stays_close_to_float32(dataset: PackedDataset, tmp_path: Path)
 def test_bad_settings(changes: dict[str, Any], match: str) -> None:
     with pytest.raises(ValueError, match=match):
         replace(SHORT, **changes)
+
+
+def test_training_begins_with_the_weights_of_another_model(
+    dataset: PackedDataset, tmp_path: Path
+) -> None:
+    first = train(dataset, TINY, SHORT, tmp_path / "first")
+    config = replace(SHORT, init=str(tmp_path / "first"), learning_rate=1e-12)
+    second = train(dataset, TINY, config, tmp_path / "second")
+    for a, b in zip(first.parameters(), second.parameters()):
+        torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-6)
+    with pytest.raises(ValueError, match="is of another width than the model"):
+        train(dataset, replace(TINY, width=2 * TINY.width), config, tmp_path / "third")
