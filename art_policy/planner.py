@@ -17,7 +17,9 @@ from freeflyer_env.constraints import keep_out_depth
 from freeflyer_env.planning import (
     SCPConfig,
     SCPResult,
+    SCPStatus,
     Trajectory,
+    race_scp,
     solve_rel,
     solve_scp,
     straight_line,
@@ -42,12 +44,13 @@ class PlannerConfig:
     """Settings of :class:`WarmStartPlanner`.
 
     Attributes:
-        n_candidates: How many of the model's proposals are refined; the cheapest result is kept.
+        n_candidates: How many of the model's proposals race (:func:`.race_scp`); the cheapest
+            result is kept.
         rel: What becomes of REL, the classical warm start: ``"fallback"``, refined if no candidate
             leads to a feasible plan; ``"portfolio"``, always refined too, so that the plan is never
             worse than REL + SCP; ``"never"``, to see what the model does alone. Unless ``"never"``,
             other homotopy classes are the last resort where REL fails, too.
-        scp: Settings of the SCP loop.
+        scp: Settings of the SCP loop. Its ``reroutes`` play no part for the model's candidates.
     """
 
     n_candidates: int = 1
@@ -141,12 +144,28 @@ class WarmStartPlanner:
         began = time.perf_counter()
         proposals = propose(self.model, search.problem, self.config.n_candidates, rel=rel)
         search.timings["propose"] = time.perf_counter() - began
+        trusted = {}
         for number, proposal in enumerate(proposals):
             reason = distrust(search.problem, proposal.trajectory)
             if reason and self.config.rel != "never":
                 search.monitor.append(f"candidate {number} not refined: {reason}")
             else:
-                search.refine(proposal.trajectory, "art", f"candidate {number}")
+                trusted[f"candidate {number}"] = proposal.trajectory
+        search.race(trusted)
+
+    def proposals(self, problem: Problem) -> list[Trajectory]:
+        """The model's warm starts of a problem, those that are distrusted left out; best first."""
+        from art_policy.rollout import propose
+
+        if self.model is None:
+            return []
+        rel = None
+        if self.model.config.head == "autoregressive":
+            rel = solve_rel(problem, self.config.scp).trajectory
+            if rel is None:
+                return []
+        found = propose(self.model, problem, self.config.n_candidates, rel=rel)
+        return [one.trajectory for one in found if not distrust(problem, one.trajectory)]
 
 
 class _Search:
@@ -170,11 +189,19 @@ class _Search:
             self.timings["rel"] += self._rel.solve_time
         return self._rel
 
-    def refine(self, warm_start: Trajectory, source: str, name: str) -> None:
-        result = solve_scp(self.problem, warm_start, self.config.scp)
-        self.timings["scp"] += result.solve_time
+    def race(self, warm_starts: dict[str, Trajectory]) -> None:
+        """Refines a model's candidates, by name; those that fall behind are given up."""
+        if not warm_starts:
+            return
+        began = time.perf_counter()
+        results = race_scp(self.problem, list(warm_starts.values()), self.config.scp)
+        self.timings["scp"] += time.perf_counter() - began
+        for (name, warm_start), result in zip(warm_starts.items(), results):
+            self._add("art", name, warm_start, result)
+
+    def _add(self, source: str, name: str, warm_start: Trajectory, result: SCPResult) -> None:
         self.attempts.append((source, warm_start, result))
-        if not result.solved:
+        if not result.solved and result.status is not SCPStatus.OUTRUN:
             self.monitor.append(f"{name}: {result.status.value}")
 
     def refine_rel(self) -> None:
@@ -183,7 +210,9 @@ class _Search:
             self.attempts.append(("rel", straight_line(self.problem), rel))
             self.monitor.append(f"REL: {rel.status.value}")
         else:
-            self.refine(rel.trajectory, "rel", "REL")
+            result = solve_scp(self.problem, rel.trajectory, self.config.scp)
+            self.timings["scp"] += result.solve_time
+            self._add("rel", "REL", rel.trajectory, result)
 
     def reroute(self) -> None:
         """The last resort: other homotopy classes, and slack on keep-out."""
@@ -192,9 +221,7 @@ class _Search:
         config = replace(self.config.scp, elastic=True, reroutes=_REROUTES)
         result = solve_scp(self.problem, rel.trajectory, config)
         self.timings["scp"] += result.solve_time
-        self.attempts.append(("reroute", start, result))
-        if not result.solved:
-            self.monitor.append(f"reroute: {result.status.value}")
+        self._add("reroute", "reroute", start, result)
 
     def finish(self) -> Plan:
         source, warm_start, result = min(self.attempts, key=lambda attempt: attempt[2].cost)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,6 +28,8 @@ class ReplanningTracker:
         config: Settings of SCP; default: those of :class:`RecedingHorizon`.
         follower: Follows the latest plan; default: PID with the paper's gains.
         least_steps: With fewer steps to go the last plan is flown to its end.
+        propose: Gives further warm starts, as for :class:`RecedingHorizon`; for a model's use
+            ``WarmStartPlanner.proposals``.
 
     Attributes:
         results: The SCP result of every re-plan of the flight.
@@ -39,11 +42,12 @@ class ReplanningTracker:
         config: SCPConfig | None = None,
         follower: Tracker | None = None,
         least_steps: int = 10,
+        propose: Callable[[Problem], Sequence[Trajectory]] | None = None,
     ) -> None:
         if not period > 0.0:
             raise ValueError(f"ReplanningTracker.period must be positive, got {period}.")
         self.problem, self.period, self.config = problem, period, config
-        self.least_steps = least_steps
+        self.least_steps, self.propose = least_steps, propose
         self.follower: Tracker = follower or PIDTracker(problem.scenario.robot)
         self.reset()
 
@@ -66,7 +70,9 @@ class ReplanningTracker:
         from freeflyer_env.planning.receding_horizon import RecedingHorizon
 
         if self._horizon is None:
-            self._horizon = RecedingHorizon(self.problem, trajectory, self.config, self.least_steps)
+            self._horizon = RecedingHorizon(
+                self.problem, trajectory, self.config, self.least_steps, self.propose
+            )
         step = self.problem.scenario.dt
         left = self.problem.final_time - time
         if time > self._due - 1e-9 and left > self.least_steps * step - 1e-9:

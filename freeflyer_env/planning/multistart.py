@@ -2,17 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from freeflyer_env.planning.homotopy import homotopy_starts
 from freeflyer_env.planning.result import SCPResult
-from freeflyer_env.planning.scp import SCPConfig, solve_rel, solve_scp, straight_line
+from freeflyer_env.planning.scp import (
+    SCPConfig,
+    SCPLoop,
+    prepare_scp,
+    solve_rel,
+    solve_scp,
+    straight_line,
+)
+from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.scenario import Problem
 
 #: Two optima are the same if their costs and positions agree to these (m/s, m).
 _SAME_COST, _SAME_POSITION = 1e-4, 0.02
+
+#: A warm start has fallen behind if its cost is so many times the best solution's after the first
+#: subproblem, and after a later one. Of 452 proposals of a model, 95 % lost less than that from
+#: there to their solution after the first, 98 % after the second.
+_BEHIND = (1.1, 1.02)
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +96,47 @@ def solve_multistart(
         jobs = (joblib.delayed(solve_scp)(problem, start, config) for start in starts)
         results = tuple(joblib.Parallel(n_jobs=n_jobs)(jobs))
     return MultistartResult(rel, results, distinct_optima(results))
+
+
+def race_scp(
+    problem: Problem, warm_starts: Sequence[Trajectory], config: SCPConfig | None = None
+) -> tuple[SCPResult, ...]:
+    """SCP from several warm starts of which those that fall behind are given up.
+
+    A subproblem's cost is close to that of the solution it leads to, so one subproblem is solved
+    from each warm start, and the cheapest is refined first; another is refined until its cost is
+    above the best solution's by so much that it will hardly fall below. It takes about half the
+    time of refining all and loses little: the cheapest optimum is missed where the cost falls late.
+
+    Args:
+        problem: What to solve.
+        warm_starts: References, each with ``problem.n_steps`` controls; at least one.
+        config: Settings of every loop; ``reroutes`` plays no part, the warm starts are the routes.
+
+    Returns:
+        One result per warm start, in their order; those given up have the status ``OUTRUN``.
+
+    Raises:
+        ValueError: Without a warm start.
+    """
+    if not warm_starts:
+        raise ValueError("race_scp needs at least one warm start.")
+    config = replace(config or SCPConfig(), reroutes=0)
+    loops = [prepare_scp(problem, start, config) for start in warm_starts]
+    for loop in loops:
+        if isinstance(loop, SCPLoop):
+            loop.step()
+    runners = [loop for loop in loops if isinstance(loop, SCPLoop)]
+    best = np.inf
+    for loop in sorted(runners, key=lambda loop: loop.cost):
+        while not loop.done:
+            if loop.cost > _BEHIND[min(loop.iterations, 2) - 1] * best:
+                loop.give_up()
+            else:
+                loop.step()
+        if loop.solved:
+            best = min(best, loop.cost)
+    return tuple(loop.result() if isinstance(loop, SCPLoop) else loop for loop in loops)
 
 
 def distinct_optima(results: tuple[SCPResult, ...]) -> tuple[SCPResult, ...]:

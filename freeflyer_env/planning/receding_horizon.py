@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from freeflyer_env.planning.homotopy import push_out
+from freeflyer_env.planning.multistart import race_scp
 from freeflyer_env.planning.result import SCPResult
 from freeflyer_env.planning.scp import SCPConfig, solve_scp
 from freeflyer_env.planning.trajectory import Trajectory
@@ -26,6 +28,8 @@ class RecedingHorizon:
         config: Settings of SCP. Default: elastic, so that a disturbed state near an obstacle does
             not stop it.
         least_steps: Shortest horizon in steps: when less time is left, the goal is reached later.
+        propose: Gives further warm starts of a problem, a model's proposals for example. They race
+            with the last plan, so that another way round an obstacle can be taken.
 
     Attributes:
         plan: The present plan, None if there has been none.
@@ -38,11 +42,12 @@ class RecedingHorizon:
         plan: Trajectory | None = None,
         config: SCPConfig | None = None,
         least_steps: int = 10,
+        propose: Callable[[Problem], Sequence[Trajectory]] | None = None,
     ) -> None:
         if least_steps < 2:
             raise ValueError(f"least_steps must be at least 2, got {least_steps}.")
         self.problem, self.least_steps = problem, least_steps
-        self.config = config or SCPConfig(elastic=True)
+        self.config, self.propose = config or SCPConfig(elastic=True), propose
         self.plan, self.planned_at = plan, 0.0
         if plan is None:
             result = solve_scp(problem, config=self.config)
@@ -57,10 +62,19 @@ class RecedingHorizon:
             time: In s since time zero of the problem.
         """
         problem = self.problem_from(state, time)
-        result = solve_scp(problem, self._shifted(problem, time), self.config)
+        result = self._solve(problem, self._shifted(problem, time))
         if result.solved:
             self.plan, self.planned_at = result.trajectory, time
         return result
+
+    def _solve(self, problem: Problem, shifted: Trajectory | None) -> SCPResult:
+        if self.propose is None:
+            return solve_scp(problem, shifted, self.config)
+        starts = [] if shifted is None else [shifted]
+        starts += self.propose(problem)
+        if not starts:
+            return solve_scp(problem, None, self.config)
+        return min(race_scp(problem, starts, self.config), key=lambda result: result.cost)
 
     def problem_from(self, state: FloatArray, time: float) -> Problem:
         """The problem that is left at ``time``: obstacles moved on, heading near the plan's."""

@@ -21,6 +21,7 @@ class SCPStatus(enum.Enum):
     INFEASIBLE_PROBLEM = "infeasible_problem"
     SLACK_LEFT = "slack_left"
     TIME_LIMIT = "time_limit"
+    OUTRUN = "outrun"
     NUMERICAL_FAILURE = "numerical_failure"
     INVALID_INPUT = "invalid_input"
 
@@ -53,6 +54,7 @@ _REMEDIES = {
     SCPStatus.TIME_LIMIT: (
         "Stopped at SCPConfig.time_limit; raise it, or use the trajectory if it is feasible."
     ),
+    SCPStatus.OUTRUN: "Given up because another warm start had led to a cheaper solution.",
     SCPStatus.NUMERICAL_FAILURE: (
         "The solver gave up on a subproblem; try another warm start or another backend."
     ),

@@ -165,14 +165,8 @@ def solve_scp(
             warm_start = _rel_of_longer(problem, config)
         if warm_start is None:
             return rel
-    if (warm_start.n_steps, warm_start.dt) != (problem.n_steps, problem.scenario.dt):
-        detail = (
-            f"the warm start has {warm_start.n_steps} steps of {warm_start.dt} s, "
-            f"the problem {problem.n_steps} of {problem.scenario.dt} s"
-        )
-        return _failure(SCPStatus.INVALID_INPUT, began, detail=detail)
-    if not (np.isfinite(warm_start.states).all() and np.isfinite(warm_start.controls).all()):
-        return _failure(SCPStatus.INVALID_INPUT, began, detail="the warm start is not finite")
+    if unfit := _unfit(problem, warm_start):
+        return _failure(SCPStatus.INVALID_INPUT, began, detail=unfit)
     attempts: list[SCPResult] = []
     for start, settings in _routes(problem, warm_start, config, attempts):
         attempts.append(_solve(problem, start, settings, keep_out=True, began=began))
@@ -185,6 +179,29 @@ def solve_scp(
     iterations = sum(attempt.iterations for attempt in attempts)
     elapsed = time.perf_counter() - began
     return replace(result, iterations=iterations, rerouted=len(attempts) - 1, solve_time=elapsed)
+
+
+def prepare_scp(problem: Problem, warm_start: Trajectory, config: SCPConfig) -> SCPLoop | SCPResult:
+    """The loop of :func:`solve_scp` before its first subproblem, without rerouting.
+
+    Returns:
+        The loop, or the failure if problem and warm start do not make sense.
+    """
+    began = time.perf_counter()
+    if unfit := "; ".join(problem.defects()) or _unfit(problem, warm_start):
+        return _failure(SCPStatus.INVALID_INPUT, began, detail=unfit)
+    return SCPLoop(problem, warm_start, config, began=began)
+
+
+def _unfit(problem: Problem, warm_start: Trajectory) -> str:
+    """Why this warm start cannot be one of this problem; empty if it can."""
+    if (warm_start.n_steps, warm_start.dt) != (problem.n_steps, problem.scenario.dt):
+        return (
+            f"the warm start has {warm_start.n_steps} steps of {warm_start.dt} s, "
+            f"the problem {problem.n_steps} of {problem.scenario.dt} s"
+        )
+    finite = np.isfinite(warm_start.states).all() and np.isfinite(warm_start.controls).all()
+    return "" if finite else "the warm start is not finite"
 
 
 def _routes(
@@ -257,51 +274,127 @@ def _solve(
     keep_out: bool,
     began: float | None = None,
 ) -> SCPResult:
-    began = time.perf_counter() if began is None else began
-    subproblem = _subproblem(problem, keep_out, config)
-    soften = config.elastic and keep_out
-    price, slack, iterations = 0.0, 0.0, 0
-    costs: list[float] = []
-    trajectory: Trajectory | None = None
-    kkt: KKTResiduals | None = None
-    status = SCPStatus.ITERATION_LIMIT
-    for iteration in range(config.max_iterations):
-        if time.perf_counter() - began > config.time_limit:
-            status = SCPStatus.TIME_LIMIT
-            break
-        iterations, trust_region, solver = iteration + 1, config.trust_region(iteration), subproblem
-        solution = solver.solve(problem, reference, trust_region)
+    loop = SCPLoop(problem, reference, config, keep_out=keep_out, began=began)
+    while not loop.done:
+        loop.step()
+    return loop.result()
+
+
+class SCPLoop:
+    """The loop itself, one subproblem at a time; :func:`solve_scp` is what users call.
+
+    Args:
+        problem: What to solve; checked by the caller, as is the reference.
+        reference: The warm start.
+        config: Settings; rerouting is the caller's.
+        keep_out: Whether the keep-out constraints are imposed.
+        began: Time at which the caller's work began, on the clock of ``time.perf_counter``.
+
+    Attributes:
+        iterations: Subproblems solved so far.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        reference: Trajectory,
+        config: SCPConfig,
+        *,
+        keep_out: bool = True,
+        began: float | None = None,
+    ) -> None:
+        self._problem, self._config, self._keep_out = problem, config, keep_out
+        self._reference = reference
+        self._began = time.perf_counter() if began is None else began
+        self._price = self._slack = 0.0
+        self._costs: list[float] = []
+        self._trajectory: Trajectory | None = None
+        self._kkt: KKTResiduals | None = None
+        self._status: SCPStatus | None = None
+        self.iterations = 0
+
+    @property
+    def done(self) -> bool:
+        """Whether the loop has ended."""
+        return self._status is not None
+
+    @property
+    def solved(self) -> bool:
+        """Whether it has ended at a verified local optimum."""
+        return self._status is SCPStatus.SOLVED
+
+    @property
+    def cost(self) -> float:
+        """Cost of the last iterate in m/s, infinite before the first."""
+        return self._costs[-1] if self._costs else np.inf
+
+    def give_up(self) -> None:
+        """Ends the loop because another warm start has led to a cheaper solution."""
+        self._status = SCPStatus.OUTRUN
+
+    def step(self) -> None:
+        """Solves one subproblem."""
+        config, soften = self._config, self._config.elastic and self._keep_out
+        if time.perf_counter() - self._began > config.time_limit:
+            self._status = SCPStatus.TIME_LIMIT
+            return
+        trust_region = config.trust_region(self.iterations)
+        self.iterations += 1
+        solver = _subproblem(self._problem, self._keep_out, config)
+        solution = solver.solve(self._problem, self._reference, trust_region)
         softened = solution.trajectory is None and soften
         if softened:
-            solver = _subproblem(problem, keep_out, config, elastic=True)
-            price = min(price * _PRICE_GROWTH, _LAST_PRICE) if price else _FIRST_PRICE
-            solution = solver.solve(problem, reference, trust_region, price)
+            solver = _subproblem(self._problem, self._keep_out, config, elastic=True)
+            grown = min(self._price * _PRICE_GROWTH, _LAST_PRICE)
+            self._price = grown if self._price else _FIRST_PRICE
+            solution = solver.solve(self._problem, self._reference, trust_region, self._price)
         if solution.trajectory is None:
             infeasible = solution.status is SolverStatus.INFEASIBLE
-            status = SCPStatus.INFEASIBLE_SUBPROBLEM if infeasible else SCPStatus.NUMERICAL_FAILURE
-            break
-        trajectory, slack = solution.trajectory, solution.slack
-        costs.append(trajectory.cost)
-        moved = np.linalg.norm(trajectory.states - reference.states, axis=1).max()
-        reference = trajectory
-        if iteration == 0 or moved > config.state_tolerance:
-            continue
-        if abs(costs[-1] - costs[-2]) >= config.cost_tolerance:
-            continue
-        if _verified(problem, trajectory, keep_out, config.between_nodes):
-            status, kkt = SCPStatus.SOLVED, solver.kkt_residuals()
-            break
-        if softened and price == _LAST_PRICE:
-            break  # settled with slack left: more iterations would only pay for it again
-    if status is SCPStatus.ITERATION_LIMIT and slack > FEASIBILITY_TOLERANCE:
-        status = SCPStatus.SLACK_LEFT
-    message = status.remedy
-    if status is not SCPStatus.SOLVED and (reason := why_infeasible(problem, keep_out=keep_out)):
-        status = SCPStatus.INFEASIBLE_PROBLEM
-        message = f"{status.remedy[:-1]}: {reason}."
-    report = trajectory.check(problem) if trajectory else None
-    elapsed = time.perf_counter() - began
-    return SCPResult(status, trajectory, iterations, tuple(costs), elapsed, report, message, kkt)
+            self._status = (
+                SCPStatus.INFEASIBLE_SUBPROBLEM if infeasible else SCPStatus.NUMERICAL_FAILURE
+            )
+            return
+        trajectory, self._slack = solution.trajectory, solution.slack
+        self._trajectory = trajectory
+        self._costs.append(trajectory.cost)
+        moved = np.linalg.norm(trajectory.states - self._reference.states, axis=1).max()
+        self._reference = trajectory
+        settled = (
+            self.iterations > 1
+            and moved <= config.state_tolerance
+            and abs(self._costs[-1] - self._costs[-2]) < config.cost_tolerance
+        )
+        if settled and _verified(self._problem, trajectory, self._keep_out, config.between_nodes):
+            self._status, self._kkt = SCPStatus.SOLVED, solver.kkt_residuals()
+        elif self.iterations == config.max_iterations or (
+            # Settled with slack left: more iterations would only pay for it again.
+            settled and softened and self._price == _LAST_PRICE
+        ):
+            left = self._slack > FEASIBILITY_TOLERANCE
+            self._status = SCPStatus.SLACK_LEFT if left else SCPStatus.ITERATION_LIMIT
+
+    def result(self) -> SCPResult:
+        """How the loop ended."""
+        status = self._status or SCPStatus.ITERATION_LIMIT
+        message = status.remedy
+        if status not in (SCPStatus.SOLVED, SCPStatus.OUTRUN):
+            reason = why_infeasible(self._problem, keep_out=self._keep_out)
+            if reason:
+                status = SCPStatus.INFEASIBLE_PROBLEM
+                message = f"{status.remedy[:-1]}: {reason}."
+        trajectory = self._trajectory
+        report = trajectory.check(self._problem) if trajectory else None
+        elapsed = time.perf_counter() - self._began
+        return SCPResult(
+            status,
+            trajectory,
+            self.iterations,
+            tuple(self._costs),
+            elapsed,
+            report,
+            message,
+            self._kkt,
+        )
 
 
 def _verified(

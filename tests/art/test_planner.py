@@ -9,7 +9,14 @@ import pytest
 from art_policy import ART, PlannerConfig, PlannerWrapper, WarmStartPlanner
 from art_policy.planner import distrust
 from freeflyer_env import HELD_OUT_SCENES, Obstacles, Problem, Scenario, sample_problem
-from freeflyer_env.planning import SCPStatus, Trajectory, solve_rel, solve_scp, straight_line
+from freeflyer_env.planning import (
+    RecedingHorizon,
+    SCPStatus,
+    Trajectory,
+    solve_rel,
+    solve_scp,
+    straight_line,
+)
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +57,16 @@ def test_a_portfolio_is_never_worse_than_rel(model, problems):
         plan = planner.plan(problem)
         assert plan.result.cost <= solve_scp(problem).cost
         assert plan.iterations >= plan.result.iterations
+
+
+def test_proposals_are_warm_starts_for_re_planning(model, problems):
+    planner = WarmStartPlanner(model, PlannerConfig(n_candidates=3))
+    flown = planner.plan(problems[0]).trajectory
+    horizon = RecedingHorizon(problems[0], flown, propose=planner.proposals)
+    result = horizon.replan(flown.states[20], 10.0)
+    assert result.solved
+    assert result.cost <= 1.001 * np.abs(flown.controls[20:]).sum()
+    assert WarmStartPlanner(None).proposals(problems[0]) == []
 
 
 def test_an_invalid_problem_is_a_failed_plan(model):

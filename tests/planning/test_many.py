@@ -9,13 +9,17 @@ from freeflyer_env.planning import (
     RecedingHorizon,
     SCPConfig,
     SCPStatus,
+    Trajectory,
     batch,
     pareto_front,
+    race_scp,
     solve_many,
     solve_multistart,
     solve_rel,
     solve_scp,
+    straight_line,
 )
+from freeflyer_env.planning.homotopy import homotopy_starts
 
 
 @pytest.fixture(scope="module")
@@ -138,3 +142,59 @@ def test_receding_horizon_keeps_its_plan_where_none_is_found_and_mends_the_state
         problem.start, 2.0
     )
     np.testing.assert_allclose(later.scenario.obstacles.centres, [[1.5, 1.2]])
+
+
+def test_a_race_finds_the_cheapest_solution_with_fewer_subproblems(problems):
+    raced = alone = 0
+    for problem in problems[:6]:
+        starts = [solve_rel(problem).trajectory, *homotopy_starts(problem, 4)]
+        full = [solve_scp(problem, start) for start in starts]
+        results = race_scp(problem, starts)
+        assert len(results) == len(starts)
+        assert min(r.cost for r in results) <= 1.02 * min(r.cost for r in full)
+        for result, other in zip(results, full):
+            if result.status is not SCPStatus.OUTRUN:
+                assert (result.status, result.cost) == (other.status, other.cost)
+        raced += sum(r.iterations for r in results)
+        alone += sum(r.iterations for r in full)
+    assert raced < 0.8 * alone
+
+
+def test_a_race_tells_what_cannot_run(problems):
+    line = straight_line(problems[0])
+    short = Trajectory.from_controls(problems[0], np.zeros((3, 3)))
+    first, second = race_scp(problems[0], [short, line])
+    assert first.status is SCPStatus.INVALID_INPUT
+    assert "3 steps" in first.message
+    assert second.cost == solve_scp(problems[0], line).cost
+    with pytest.raises(ValueError, match="at least one warm start"):
+        race_scp(problems[0], [])
+
+
+def test_moving_obstacles_are_passed_where_the_line_meets_them():
+    """One that crosses the line when the robot is there: both sides are starts."""
+    crossing = Obstacles(np.array([[1.75, 0.5]]), np.array([0.15]), np.array([[0.0, 0.0375]]))
+    problem = Problem(Scenario(crossing), [0.3, 1.25, 0, 0, 0, 0], [3.2, 1.25, 0, 0, 0, 0])
+    heights = [start.states[40, 1] for start in homotopy_starts(problem, 2)]
+    assert min(heights) < 1.0
+    assert max(heights) > 1.5
+    heights = [best.trajectory.states[40, 1] for best in solve_multistart(problem, 3).optima]
+    assert min(heights) < 1.25 < max(heights)
+
+
+def test_a_horizon_takes_a_cheaper_way_that_is_proposed():
+    problem = sample_problem(np.random.default_rng(4), HELD_OUT_SCENES[0])
+    optima = solve_multistart(problem, 6).optima
+    worse, best = optima[-1].trajectory, optima[0]
+    assert worse.cost > 1.02 * best.cost
+    alone = RecedingHorizon(problem, worse).replan(problem.start, 0.0)
+    asked = []
+
+    def propose(left):
+        asked.append(left)
+        return [best.trajectory]
+
+    helped = RecedingHorizon(problem, worse, propose=propose).replan(problem.start, 0.0)
+    assert len(asked) == 1
+    assert alone.cost == pytest.approx(worse.cost, rel=1e-3)
+    assert helped.cost == pytest.approx(best.cost, rel=1e-3)
