@@ -259,7 +259,10 @@ def _parser() -> argparse.ArgumentParser:
         "models", nargs="+", metavar="MODEL", help="a shipped model's name, folder, Hugging Face id"
     )
     sub.add_argument("--problems", type=count, default=300)
-    sub.add_argument("--scenes", default="held-out", help="'held-out', 'random' or a scene's name")
+    text = "'held-out', 'random', 'clutter' or a scene's name"
+    sub.add_argument("--scenes", default="held-out", help=text)
+    sub.add_argument("--obstacles", type=int, nargs="+", help="numbers of obstacles of new scenes")
+    sub.add_argument("--obstacle-speed", type=float, default=0.0, help="largest, in m/s")
     sub.add_argument("--final-time", type=float, nargs="+", default=[40.0], help="in s")
     sub.add_argument("--candidates", type=count, default=4, help="most candidates refined")
     sub.add_argument("--starts", type=count, default=13, help="starts for the best known solution")

@@ -58,7 +58,14 @@ def evaluate_models(options: argparse.Namespace) -> None:
     partial = Path(f"{options.out}.partial") if options.out else None
     records = evaluate(
         options.models,
-        evaluation_problems(options.problems, options.scenes, options.final_time, options.seed),
+        evaluation_problems(
+            options.problems,
+            options.scenes,
+            options.final_time,
+            options.seed,
+            options.obstacles,
+            options.obstacle_speed,
+        ),
         options.candidates,
         options.starts,
         options.workers,

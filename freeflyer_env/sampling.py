@@ -20,6 +20,7 @@ def sample_obstacles(
     n_obstacles: int = 4,
     radius_range: tuple[float, float] = (0.1, 0.2),
     table: tuple[float, float] = (3.5, 2.5),
+    gap: float = 0.0,
 ) -> Obstacles:
     """Random discs that do not overlap, centres with x in [0.5, 3.0] m (paper, ART-Rs).
 
@@ -28,11 +29,12 @@ def sample_obstacles(
         n_obstacles: How many discs.
         radius_range: Smallest and largest radius in m.
         table: Size of the table in m.
+        gap: Least distance between two discs' edges in m.
 
     Raises:
         ValueError: If so many discs do not fit.
     """
-    return Obstacles.from_rows(_sample_discs(rng, n_obstacles, radius_range, table))
+    return Obstacles.from_rows(_sample_discs(rng, n_obstacles, radius_range, table, gap))
 
 
 def _sample_discs(
@@ -40,16 +42,19 @@ def _sample_discs(
     n_obstacles: int,
     radius_range: tuple[float, float],
     table: tuple[float, float],
+    gap: float = 0.0,
 ) -> FloatArray:
     """Rows ``(x, y, radius)`` of :func:`sample_obstacles`."""
     rows: list[tuple[float, float, float]] = []
-    for _ in range(10_000):
+    for attempt in range(10_000):
         if len(rows) == n_obstacles:
             break
+        if gap and attempt % 500 == 499:
+            rows = []  # the first ones may have left no room
         radius = rng.uniform(*radius_range)
         x = rng.uniform(0.5, table[0] - 0.5)
         y = rng.uniform(radius, table[1] - radius)
-        if all(math.hypot(x - other[0], y - other[1]) > radius + other[2] for other in rows):
+        if all(math.hypot(x - other[0], y - other[1]) > radius + other[2] + gap for other in rows):
             rows.append((x, y, radius))
     if len(rows) < n_obstacles:
         raise ValueError(f"Could not place {n_obstacles} obstacles on the table; ask for fewer.")

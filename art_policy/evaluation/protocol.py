@@ -7,16 +7,24 @@ as infeasible for a method if that loop did not end with a verified solution.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from art_policy.planner import PlannerConfig, WarmStartPlanner
-from freeflyer_env.planning import SCPConfig, SCPResult, solve_rel, solve_scp
+from freeflyer_env.planning import (
+    SCPConfig,
+    SCPResult,
+    race_scp,
+    solve_rel,
+    solve_scp,
+    straight_line,
+)
 from freeflyer_env.planning.homotopy import homotopy_starts
-from freeflyer_env.sampling import sample_problem
+from freeflyer_env.robot import Robot
+from freeflyer_env.sampling import sample_obstacles, sample_problem
 from freeflyer_env.scenario import HELD_OUT_SCENES, Problem, Scenario
 
 if TYPE_CHECKING:
@@ -27,8 +35,12 @@ if TYPE_CHECKING:
 #: one.
 _TEST_SEED_KEY = 7_777_777
 
-#: Numbers of starts of which multi-start is reported.
+#: Numbers of starts of which multi-start is reported, besides the one that takes as long as a
+#: model's candidates.
 _MULTI_START = (2, 4)
+
+#: Numbers of obstacles in clutter, and the least gap between two in robot diameters.
+_CLUTTER, _LEAST_GAP = (8, 9, 10, 11, 12), 1.2
 
 
 @dataclass(frozen=True)
@@ -56,6 +68,7 @@ class ProblemRecord:
         scene: Name of the scene.
         index: Number of the problem.
         final_time: In s.
+        n_obstacles: Number of obstacles.
         c_rel: Nodes of REL that violate keep-out; -1 where REL failed.
         rel_cost: Cost of REL, the bound, in m/s.
         best_known: Cheapest solution of any method and start in m/s, infinite if there is none.
@@ -65,6 +78,7 @@ class ProblemRecord:
     scene: str
     index: int
     final_time: float
+    n_obstacles: int
     c_rel: int
     rel_cost: float
     best_known: float
@@ -94,31 +108,51 @@ def evaluation_problems(
     scenes: str = "held-out",
     final_times: Sequence[float] = (40.0,),
     seed: int = 0,
+    n_obstacles: Sequence[int] | None = None,
+    obstacle_speed: float = 0.0,
 ) -> list[tuple[str, int, Problem]]:
     """Test problems that no dataset contains: ``(scene, index, problem)``, ``n_problems`` in all.
 
     Args:
-        n_problems: How many, spread evenly over scenes and final times.
-        scenes: ``"held-out"`` (the paper's three), ``"random"`` (a new scene each), or a scene's
-            name.
+        n_problems: How many, spread evenly over scenes, final times and numbers of obstacles.
+        scenes: ``"held-out"`` (the paper's three), ``"random"`` (a new scene each), ``"clutter"``
+            (random, every gap at least 1.2 times as wide as the robot), or a scene's name.
         final_times: Final times in s.
         seed: Another seed gives other problems.
+        n_obstacles: Numbers of obstacles of the new scenes; default: 4, in clutter 8 to 12.
+        obstacle_speed: Largest speed of the obstacles of random scenes in m/s.
+
+    Raises:
+        ValueError: If an argument is out of range or does not fit ``scenes``.
     """
     if n_problems < 1:
         raise ValueError(f"The number of problems must be at least 1, got {n_problems}.")
+    is_new = scenes in ("random", "clutter")
+    if ((n_obstacles or obstacle_speed) and not is_new) or (obstacle_speed and scenes != "random"):
+        raise ValueError(
+            "The number of obstacles can be chosen for scenes 'random' and 'clutter', their speed "
+            f"for 'random', not for {scenes!r}."
+        )
     scenarios: list[tuple[str, Scenario | None]]
     if scenes == "held-out":
         scenarios = [(f"held-out-{i}", scene) for i, scene in enumerate(HELD_OUT_SCENES, 1)]
-    elif scenes == "random":
-        scenarios = [("random", None)]
+    elif is_new:
+        scenarios = [(scenes, None)]
     else:
         scenarios = [(scenes, Scenario.named(scenes))]
+    counts = n_obstacles or (_CLUTTER if scenes == "clutter" else (4,))
     problems = []
     for index in range(n_problems):
         rng = np.random.default_rng([_TEST_SEED_KEY, seed, index])
         name, scenario = scenarios[index % len(scenarios)]
-        final_time = final_times[(index // len(scenarios)) % len(final_times)]
-        problems.append((name, index, sample_problem(rng, scenario, final_time)))
+        turn = index // len(scenarios)
+        final_time = final_times[turn % len(final_times)]
+        count = counts[turn // len(final_times) % len(counts)]
+        if scenes == "clutter":
+            gap = _LEAST_GAP * 2.0 * Robot().radius
+            scenario = Scenario(sample_obstacles(rng, count, gap=gap))
+        problem = sample_problem(rng, scenario, final_time, count, obstacle_speed)
+        problems.append((name, index, problem))
     return problems
 
 
@@ -132,10 +166,10 @@ def evaluate_problem(
 ) -> ProblemRecord:
     """Runs every method on one problem.
 
-    The methods are REL, with hard keep-out and with slack on it; each model, its first candidate
-    and the best of several, without REL to fall back on, so that its failures show; and multi-start
-    over homotopy classes: the best of two, of four, and of as many as take no longer than the first
-    model's best of several.
+    The methods are REL, with hard keep-out and with slack on it; each model, its first candidate,
+    the best of several, without REL to fall back on, so that its failures show, and the best of
+    several and REL; and multi-start over homotopy classes, in a race as the candidates are: the
+    best of two, of four, and of as many as take no longer than the first model's best of several.
 
     Args:
         models: By the name under which they are reported.
@@ -148,49 +182,50 @@ def evaluate_problem(
     rel = solve_rel(problem)
     bound = rel.trajectory
     c_rel = int(bound.violations(problem).sum()) if bound is not None else -1
-    began = time.perf_counter()
-    refined = solve_scp(problem)
-    outcomes = {"REL": _outcome(refined, time.perf_counter() - began)}
-    began = time.perf_counter()
-    elastic = solve_scp(problem, config=SCPConfig(elastic=True))
-    outcomes["REL, elastic"] = _outcome(elastic, time.perf_counter() - began)
+    outcomes = {
+        "REL": _timed(lambda: solve_scp(problem)),
+        "REL, elastic": _timed(lambda: solve_scp(problem, config=SCPConfig(elastic=True))),
+    }
     for name, model in models.items():
         most = n_candidates
         if model.config.head == "multi_hypothesis":
             most = min(most, model.config.n_hypotheses)
-        for count in sorted({1, most}):
-            planner = WarmStartPlanner(model, PlannerConfig(n_candidates=count, rel="never"))
-            plan = planner.plan(problem)
-            label = name if count == 1 else f"{name}, best of {count}"
+        settings = {
+            name: PlannerConfig(1, "never"),
+            f"{name}, best of {most}": PlannerConfig(most, "never"),
+            f"{name}, best of {most} and REL": PlannerConfig(most, "portfolio"),
+        }
+        if most == 1:
+            del settings[f"{name}, best of 1"]
+        for label, config in settings.items():
+            plan = WarmStartPlanner(model, config).plan(problem)
             outcomes[label] = _outcome(plan.result, plan.timings["total"])
-    budget = max((outcomes[label].time for label in outcomes if "best of" in label), default=0.0)
-    starts = _multi_start(problem, refined, outcomes["REL"].time, max(n_starts, *_MULTI_START))
+    budget = max((o.time for label, o in outcomes.items() if "best of" in label), default=0.0)
+    counts = sorted({*_MULTI_START, min(8, n_starts), n_starts})
+    raced = {count: _timed(lambda: _multi_start(problem, count)) for count in counts}  # noqa: B023
     for count in _MULTI_START:
-        outcomes[f"multi-start, best of {count}"] = _best(starts[:count])
+        outcomes[f"multi-start, best of {count}"] = raced[count]
     if budget:
-        affordable = [start for start in starts if start[1] <= budget] or starts[:1]
-        outcomes["multi-start, equal time"] = _best(affordable)
-    best = min([outcome.cost for outcome in outcomes.values()] + [r.cost for r, _ in starts])
-    return ProblemRecord(scene, index, problem.final_time, c_rel, rel.cost, best, outcomes)
+        affordable = [raced[count] for count in counts if raced[count].time <= budget]
+        outcomes["multi-start, equal time"] = (affordable or [outcomes["REL"]])[-1]
+    best = min(outcome.cost for outcome in [*outcomes.values(), *raced.values()])
+    size = len(problem.scenario.obstacles)
+    return ProblemRecord(scene, index, problem.final_time, size, c_rel, rel.cost, best, outcomes)
 
 
-def _multi_start(
-    problem: Problem, refined: SCPResult, time_of_rel: float, n_starts: int
-) -> list[tuple[SCPResult, float]]:
-    """SCP's results from REL and other homotopy classes, with the time it took until there."""
-    began = time.perf_counter()
-    results = [(refined, time_of_rel)]
+def _multi_start(problem: Problem, n_starts: int) -> SCPResult:
+    """The best that a race from REL and other homotopy classes leads to."""
+    rel = solve_rel(problem)
     if problem.defects():
-        return results
-    for start in homotopy_starts(problem, n_starts - 1):
-        result = solve_scp(problem, start)
-        results.append((result, time_of_rel + time.perf_counter() - began))
-    return results
+        return rel
+    starts = [rel.trajectory or straight_line(problem), *homotopy_starts(problem, n_starts - 1)]
+    return min(race_scp(problem, starts), key=lambda result: result.cost)
 
 
-def _best(starts: list[tuple[SCPResult, float]]) -> Outcome:
-    best = min((result for result, _ in starts), key=lambda result: result.cost)
-    return _outcome(best, starts[-1][1])
+def _timed(solve: Callable[[], SCPResult]) -> Outcome:
+    began = time.perf_counter()
+    result = solve()
+    return _outcome(result, time.perf_counter() - began)
 
 
 def _outcome(result: SCPResult, elapsed: float) -> Outcome:

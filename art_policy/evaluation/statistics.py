@@ -124,6 +124,11 @@ def report(records: Sequence[ProblemRecord], model: str | Sequence[str]) -> dict
         groups[f"scene {scene}"] = [r for r in records if r.scene == scene]
     for threshold in C_REL_THRESHOLDS[1:]:
         groups[f"C_REL >= {threshold}"] = [r for r in records if r.c_rel >= threshold]
+    solvable = [r for r in records if np.isfinite(r.best_known)]
+    if len(solvable) < len(records):
+        groups["solvable by some start"] = solvable
+    for count in sorted({r.n_obstacles for r in records}):
+        groups[f"{count} obstacles"] = [r for r in records if r.n_obstacles == count]
     for final_time in sorted({r.final_time for r in records}):
         groups[f"T_f = {final_time:g} s"] = [r for r in records if r.final_time == final_time]
     return {

@@ -25,7 +25,7 @@ def record(rel_cost, costs, c_rel=0):
         for name, (cost, iterations) in costs.items()
     }
     best = min(cost for cost, _ in costs.values())
-    return ProblemRecord("held-out-1", 0, 40.0, c_rel, rel_cost, best, outcomes)
+    return ProblemRecord("held-out-1", 0, 40.0, 4, c_rel, rel_cost, best, outcomes)
 
 
 def test_figures_follow_the_protocol():
@@ -88,6 +88,21 @@ def test_problems_are_reproducible_and_spread():
     random = evaluation_problems(2, "random")
     rows = [problem.scenario.obstacles.rows() for _, _, problem in random]
     assert not np.array_equal(*rows)
+    clutter = evaluation_problems(10, "clutter", (40.0, 80.0))
+    for _, index, problem in clutter:
+        obstacles = problem.scenario.obstacles
+        assert len(obstacles) == 8 + index // 2
+        gaps = np.linalg.norm(obstacles.centres[:, None] - obstacles.centres, axis=2)
+        gaps -= obstacles.radii[:, None] + obstacles.radii
+        assert gaps[~np.eye(len(obstacles), dtype=bool)].min() > 0.36
+    cells = evaluation_problems(12, "random", (40.0, 60.0), n_obstacles=(0, 2, 8))
+    assert {(p.final_time, len(p.scenario.obstacles)) for _, _, p in cells} == {
+        (time, count) for time in (40.0, 60.0) for count in (0, 2, 8)
+    }
+    ((_, _, moving),) = evaluation_problems(1, "random", obstacle_speed=0.02)
+    assert moving.scenario.obstacles.moving
+    with pytest.raises(ValueError, match="for scenes 'random' and 'clutter'"):
+        evaluation_problems(1, "held-out", n_obstacles=(2,))
     with pytest.raises(ValueError, match="at least 1"):
         evaluation_problems(0)
     with pytest.raises(ValueError, match="Did you mean 'held-out-1'"):
@@ -95,7 +110,7 @@ def test_problems_are_reproducible_and_spread():
 
 
 METHODS = {
-    *("REL", "REL, elastic", "ART", "ART, best of 2"),
+    *("REL", "REL, elastic", "ART", "ART, best of 2", "ART, best of 2 and REL"),
     *("multi-start, best of 2", "multi-start, best of 4", "multi-start, equal time"),
 }
 
@@ -108,13 +123,15 @@ def test_end_to_end(untrained_model, tmp_path):
     for r in records:
         assert set(r.outcomes) == METHODS
         costs = {name: outcome.cost for name, outcome in r.outcomes.items()}
-        assert costs["ART, best of 2"] <= costs["ART"]
-        assert costs["multi-start, best of 4"] <= costs["multi-start, best of 2"] <= costs["REL"]
-        assert r.best_known == pytest.approx(min(costs.values()))
+        # A race may give up, rarely, what would have been cheapest by a little in the end.
+        assert costs["ART, best of 2"] <= 1.05 * costs["ART"]
+        assert costs["multi-start, best of 2"] <= 1.05 * costs["REL"]
+        assert costs["ART, best of 2 and REL"] <= min(costs["REL"], costs["ART, best of 2"])
+        assert r.best_known <= min(costs.values())
         assert r.rel_cost <= costs["REL"] + 1e-6
         assert ProblemRecord.from_dict(json.loads(json.dumps(r.to_dict()))) == r
     data = report(records, "untrained")
-    assert markdown_table(data["groups"]["all"]).count("\n") == 9
+    assert markdown_table(data["groups"]["all"]).count("\n") == 10
     save_report(data, tmp_path / "sub" / "report.json")
     loaded = json.loads((tmp_path / "sub" / "report.json").read_text())
     assert len(loaded["records"]) == 6
