@@ -1,7 +1,7 @@
 """Plans from learned and from classical warm starts, flown with and without re-planning.
 
-``python -m benchmarks.flights`` plans problems of the paper's settings (held-out scenes in 40 s, the
-nominal scene in 40 and 80 s) with a model and with REL, flies every plan in ``FreeFlyer-v0`` with
+``python -m benchmarks.flights`` plans problems of the paper's settings (held-out scenes in 40 s,
+the nominal scene in 40 and 80 s) with a model and with REL, flies every plan in ``FreeFlyer-v0`` with
 the thrusters and the disturbances of the testbed, and prints a Markdown table for each setting;
 ``--out FILE`` writes them as JSON. Every method flies the same problems with the same disturbances.
 """
@@ -24,7 +24,7 @@ from freeflyer_env.control import ReplanningTracker, Tracker
 from freeflyer_env.disturbances import Disturbances
 from freeflyer_env.planning import SCPConfig
 
-#: Scenes, final time in s, and the cumulative firing time in s that the paper reports of its flight.
+#: Scenes, final time in s, and the cumulative firing time in s of the paper's flight.
 SETTINGS = [("held-out", 40.0, 88.3), ("nominal", 40.0, 90.5), ("nominal", 80.0, 58.3)]
 
 DISTURBANCES = "testbed"
