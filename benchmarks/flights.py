@@ -1,9 +1,10 @@
 """Plans from learned and from classical warm starts, flown with and without re-planning.
 
 ``python -m benchmarks.flights`` plans problems of the paper's settings (held-out scenes in 40 s,
-the nominal scene in 40 and 80 s) with a model and with REL, flies every plan in ``FreeFlyer-v0`` with
-the thrusters and the disturbances of the testbed, and prints a Markdown table for each setting;
-``--out FILE`` writes them as JSON. Every method flies the same problems with the same disturbances.
+the nominal scene in 40 and 80 s) with a model and with REL, flies every plan in ``FreeFlyer-v0``
+with the thrusters and the disturbances of the testbed, and prints a Markdown table for each
+setting; ``--out FILE`` writes them as JSON. Every method flies the same problems with the same
+disturbances.
 """
 
 from __future__ import annotations
