@@ -244,8 +244,9 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", help="Minari data root (default: Minari's own)")
     sub.add_argument("--force", action="store_true", help="replace a dataset of the same id")
 
-    sub = command("train", train_model, "Train a model on a dataset; resumes.")
-    sub.add_argument("dataset", help="Minari id, or a folder of shards or of a packed dataset")
+    sub = command("train", train_model, "Train a model on datasets; resumes.")
+    text = "Minari id, or a folder of shards or of a packed dataset"
+    sub.add_argument("datasets", nargs="+", metavar="DATASET", help=text)
     heads = ("multi_hypothesis", "autoregressive", "autoregressive_small")
     sub.add_argument("--head", choices=heads, default=heads[0])
     sub.add_argument("--minutes", type=float, help="length of the training")

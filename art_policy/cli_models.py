@@ -5,16 +5,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from art_policy.cli_io import check_out, configure, print_result
 
+if TYPE_CHECKING:
+    from freeflyer_datasets import PackedDataset
+
 
 def train_model(options: argparse.Namespace) -> None:
-    """Trains a model on a dataset."""
+    """Trains a model on datasets."""
     from art_policy.layers import ARTConfig
     from art_policy.train import TrainConfig, train
-    from freeflyer_datasets import PackedDataset
 
     presets: dict[str, Callable[..., ARTConfig]] = {
         "multi_hypothesis": ARTConfig,
@@ -25,19 +27,28 @@ def train_model(options: argparse.Namespace) -> None:
     length = {"max_minutes": options.minutes, "max_steps": options.steps, "seed": options.seed}
     config = configure(TrainConfig, "--train-config", options.train_config, **length)
     check_out(options.out, ())
-    if Path(options.dataset).is_dir():
-        folder = Path(options.dataset)
-        is_packed = (folder / "meta.json").is_file()
-        dataset = PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
-    else:
-        dataset = PackedDataset.from_minari(options.dataset)
-    model = train(dataset, model_config, config, options.out)
+    datasets = [_dataset(name) for name in options.datasets]
+    model = train(datasets, model_config, config, options.out)
     text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
     print_result(
         options,
-        {"out": options.out, "parameters": model.num_parameters, "problems": dataset.n_problems},
+        {
+            "out": options.out,
+            "parameters": model.num_parameters,
+            "problems": sum(dataset.n_problems for dataset in datasets),
+        },
         f"{text} {options.out}",
     )
+
+
+def _dataset(name: str) -> PackedDataset:
+    from freeflyer_datasets import PackedDataset
+
+    folder = Path(name)
+    if not folder.is_dir():
+        return PackedDataset.from_minari(name)
+    is_packed = (folder / "meta.json").is_file()
+    return PackedDataset.open(folder) if is_packed else PackedDataset.from_shards(folder)
 
 
 def evaluate_models(options: argparse.Namespace) -> None:

@@ -14,7 +14,7 @@ nodes can be read off. There is no order among obstacles, and no limit to their 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import torch
@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, initialise
-from art_policy.sequence import ProblemBatch, random_flags
+from art_policy.sequence import ProblemBatch, random_discs, random_flags
 
 _N_PROBLEM_FEATURES = 20
 _N_DISC_FEATURES = 14
@@ -30,6 +30,7 @@ _RATE_SCALE = (10.0, 10.0, 5.0)  # s/m, s/m, s/rad
 _SHORTEST = 5.0  # s: shorter final times are described as this one
 _POSE_SCALE = (0.25, 0.25, 0.5)  # m, m, rad: size of a typical deviation
 _ROBOT_RADIUS = 0.15  # m: half the width of the gap that lets the robot pass
+_DECOY_MARGIN = 0.02  # m: paths are compared at few times, and may dip between them
 
 
 @lru_cache(maxsize=64)
@@ -76,6 +77,31 @@ class HypothesisBatch:
         flip = self.paths.new_tensor([-1.0, 1.0, -1.0])
         paths = torch.where(reverse[:, None, None, None], paths.flip(2) * flip, paths)
         return HypothesisBatch(problems, paths, self.costs)
+
+    def with_decoys(
+        self, table: tuple[float, float], dt: float, generator: torch.Generator
+    ) -> HypothesisBatch:
+        """Each example with more discs, at rest or moving, in a random share of its free rows.
+
+        No disc comes near the cheapest optimum, which therefore stays what it is: more constraints
+        make nothing cheaper. Other optima that the discs do touch are dropped.
+        """
+        discs, added = self.problems.discs, random_discs(self.problems, table, generator)
+        share = torch.linspace(0.0, 1.0, self.paths.shape[2])[::2]
+        way = self.problems.goal - self.problems.start
+        line = self.problems.start[:, None, :2] + share[:, None] * way[:, None, :2]
+        positions = line[:, None] + self.paths[:, :, ::2, :2]  # (B, R, S / 2, 2)
+        times = share * (self.problems.final_time[:, None] - dt)  # (B, S / 2)
+        centres = added[:, None, :, :2] + times[..., None, None] * added[:, None, :, 3:]
+        gaps = (positions[:, :, :, None] - centres[:, None]).norm(dim=4).amin(2)  # (B, R, M)
+        near = gaps < added[:, None, :, 2] + _DECOY_MARGIN
+        wanted = torch.rand(discs.shape[:2], generator=generator) < torch.rand(
+            len(discs), 1, generator=generator
+        )
+        placed = wanted & ~near[:, 0] & ~self.problems.present  # (B, M)
+        lost = (near & placed[:, None]).any(2)  # never the cheapest
+        problems = replace(self.problems, discs=torch.where(placed[..., None], added, discs))
+        return HypothesisBatch(problems, self.paths, self.costs.masked_fill(lost, math.inf))
 
 
 @dataclass(frozen=True)
@@ -211,6 +237,7 @@ def _assign(distances: Tensor, costs: Tensor) -> tuple[Tensor, Tensor]:
     return torch.stack(owners, dim=1), costs.isfinite() & (order < n_hypotheses)
 
 
+@torch.compiler.disable
 def _padding_mask(problems: ProblemBatch, n_others: int) -> Tensor | None:
     """``(B, 1, 1, L)`` True at real tokens, or None where nothing is padded."""
     present = problems.present

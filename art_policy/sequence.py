@@ -8,12 +8,14 @@ third, quarter turns of the body, is built into the models, which see headings o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from freeflyer_env.robot import Robot
 from freeflyer_env.scenario import Problem, Scenario
@@ -74,6 +76,18 @@ class ProblemBatch:
         ).reshape(-1, 13)
         table = torch.from_numpy(numbers)
         return cls(table[:, :6], table[:, 6:12], torch.from_numpy(discs), table[:, 12])
+
+    @classmethod
+    def joined(cls, batches: Sequence[ProblemBatch]) -> ProblemBatch:
+        """Batches behind one another; the number of discs may differ."""
+        most = max(batch.discs.shape[1] for batch in batches)
+        discs = [F.pad(b.discs, (0, 0, 0, most - b.discs.shape[1])) for b in batches]
+        return cls(
+            torch.cat([batch.start for batch in batches]),
+            torch.cat([batch.goal for batch in batches]),
+            torch.cat(discs),
+            torch.cat([batch.final_time for batch in batches]),
+        )
 
     def __getitem__(self, index: Tensor) -> ProblemBatch:
         return ProblemBatch(*(getattr(self, item.name)[index] for item in fields(self)))
@@ -136,6 +150,25 @@ class ProblemBatch:
 def random_flags(batch: int, generator: torch.Generator) -> Tensor:
     """``(batch,)`` fair coin tosses."""
     return torch.rand(batch, generator=generator) < 0.5
+
+
+#: Random discs move in one problem of so many, at up to this speed in m/s, as in general-v0.
+_MOVING_SHARE, _DISC_SPEED = 0.25, 0.025
+
+
+def random_discs(
+    problems: ProblemBatch, table: tuple[float, float], generator: torch.Generator
+) -> Tensor:
+    """Rows ``(B, M, 5)`` as in :attr:`ProblemBatch.discs`, drawn as random scenes draw theirs."""
+    scenario, shape = Scenario(), problems.discs.shape[:2]
+    draw = torch.rand(*shape, 5, generator=generator)
+    radius = 0.1 + 0.1 * draw[..., 0]
+    x = 0.5 + (table[0] - 1.0) * draw[..., 1]
+    y = radius + (table[1] - 2.0 * radius) * draw[..., 2]
+    moving = torch.rand(shape[0], 1, generator=generator) < _MOVING_SHARE
+    speed, course = _DISC_SPEED * draw[..., 3] * moving, 2.0 * math.pi * draw[..., 4]
+    keep_out = (radius + scenario.robot.radius) * scenario.keep_out_factor
+    return torch.stack([x, y, keep_out, speed * course.cos(), speed * course.sin()], dim=2)
 
 
 @dataclass(frozen=True, eq=False)

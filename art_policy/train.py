@@ -13,12 +13,11 @@ import logging
 import math
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from tqdm.auto import tqdm
@@ -55,8 +54,10 @@ class TrainConfig:
         gradient_clip: Largest norm of the gradient.
         ema_decay: Decay of the running average of the weights, which is what is saved.
         augment: Whether examples are put under random symmetries of the problem.
-        tails: Multi-hypothesis only: whether for every problem one is added that begins in flight,
-            for re-planning.
+        tails: Multi-hypothesis only: share of the problems of which one is added that begins in
+            flight, for re-planning.
+        max_discs: Multi-hypothesis only: if given, augmentation adds up to so many discs to a scene
+            where they leave the best optimum what it is.
         init: Model whose weights training begins with, as :meth:`ART.from_pretrained` takes it;
             None for random ones.
         validation_fraction: Share of the problems that are held out.
@@ -80,7 +81,8 @@ class TrainConfig:
     gradient_clip: float = 1.0
     ema_decay: float = 0.999
     augment: bool = True
-    tails: bool = True
+    tails: float = 0.25
+    max_discs: int | None = None
     init: str | None = None
     validation_fraction: float = 0.05
     log_every: int = 50
@@ -141,7 +143,7 @@ class _State:
         torch.manual_seed(config.seed)
         model = ART(model_config).to(config.device)
         if config.init is not None:
-            model.load_state_dict(_initial(config.init, model_config).state_dict())
+            _initialise(model, config.init)
         matrices = [p for p in model.parameters() if p.dim() >= 2]
         vectors = [p for p in model.parameters() if p.dim() < 2]
         groups = [
@@ -232,7 +234,7 @@ _MAY_CHANGE = frozenset(
 
 
 def train(
-    dataset: PackedDataset,
+    data: PackedDataset | Sequence[PackedDataset],
     model_config: ARTConfig,
     config: TrainConfig,
     out: str | Path,
@@ -241,7 +243,8 @@ def train(
     """Trains a model and writes it, its log and its checkpoint into ``out``.
 
     Args:
-        dataset: Packed dataset; a share of its problems is held out for validation.
+        data: Packed dataset, or several; a share of the problems of each is held out for
+            validation.
         model_config: Size and kind of the model.
         config: How to train.
         out: Folder for ``model.safetensors``, ``config.json``, ``log.jsonl``, ``checkpoint.pt``.
@@ -258,13 +261,12 @@ def train(
     out.mkdir(parents=True, exist_ok=True)
     if config.threads:
         torch.set_num_threads(config.threads)
-    parts = dataset.split(config.validation_fraction)
-    training = _examples(dataset, parts[0], model_config, config.tails)
-    validation = _examples(dataset, parts[1], model_config)
+    datasets = list(data) if isinstance(data, Sequence) else [data]
+    training, validation = _examples(datasets, model_config, config)
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
-    data = {"dataset": dataset.dataset_id, "examples": len(training)}
-    state = _State.create(model_config, config, data)
+    source = {"dataset": " + ".join(each.dataset_id for each in datasets)}
+    state = _State.create(model_config, config, {**source, "examples": len(training)})
     if isinstance(state.model.net, Autoregressive) and isinstance(training, SequenceSet):
         sample = training.batch(torch.arange(min(len(training), 2048)), torch.Generator())
         state.model.net.fit_scales(sample)
@@ -316,22 +318,40 @@ def _loop(
 
 
 def _examples(
-    dataset: PackedDataset, trajectories: np.ndarray, config: ARTConfig, tails: bool = False
-) -> ExampleSet:
-    if config.head == "autoregressive":
-        return SequenceSet(dataset, trajectories, config.table, config.context_length)
-    return HypothesisSet(dataset, trajectories, config.table, tails)
+    datasets: Sequence[PackedDataset], model: ARTConfig, config: TrainConfig
+) -> tuple[ExampleSet, ExampleSet]:
+    """What to train on, and what to validate on."""
+    splits = [dataset.split(config.validation_fraction) for dataset in datasets]
+    pairs = list(zip(datasets, splits))
+    if model.head == "autoregressive":
+        training, validation = (
+            SequenceSet.joined(
+                [SequenceSet(d, s[side], model.table, model.context_length) for d, s in pairs]
+            )
+            for side in range(2)
+        )
+        return training, validation
+    tails, most = config.tails, config.max_discs
+    return (
+        HypothesisSet.joined([HypothesisSet(d, s[0], model.table, tails, most) for d, s in pairs]),
+        HypothesisSet.joined([HypothesisSet(d, s[1], model.table) for d, s in pairs]),
+    )
 
 
-def _initial(name: str, config: ARTConfig) -> ART:
-    model = ART.from_pretrained(name)
-    ours, theirs = config.to_dict(), model.config.to_dict()
-    if changed := [key for key in ours if ours[key] != theirs[key]]:
+def _initialise(model: ART, name: str) -> None:
+    """Begins with the weights of another model; another number of hypotheses begins anew."""
+    other = ART.from_pretrained(name)
+    ours, theirs = model.config.to_dict(), other.config.to_dict()
+    changed = [key for key in ours if ours[key] != theirs[key]]
+    if set(changed) - {"n_hypotheses", "dropout"}:
         raise ValueError(
             f"TrainConfig.init: {name!r} is of another {', '.join(changed)} than the model that is "
             "to be trained."
         )
-    return model
+    weights = other.state_dict()
+    if "n_hypotheses" in changed:
+        del weights["net.query_embedding"]
+    model.load_state_dict(weights, strict=False)
 
 
 def _batch_size(training: ExampleSet, config: TrainConfig) -> int:
@@ -363,10 +383,10 @@ def _seed(seed: int, step: int) -> int:
 
 @torch.no_grad()
 def _validate(model: ART, validation: ExampleSet, config: TrainConfig) -> dict[str, float]:
-    """Mean figures over the held-out problems (at most 4,096), names prefixed by ``val_``."""
+    """Mean figures over held-out problems (4,096 of them at most), names prefixed by ``val_``."""
     count = min(len(validation), 4096)
     sums: dict[str, float] = {}
-    for index in torch.arange(count).split(512):
+    for index in torch.linspace(0, len(validation) - 1, count).long().split(512):
         batch: Any = validation.batch(index, None).to(config.device)
         with _autocast(config):
             loss, figures = model.net.loss(batch)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import fields
+import copy
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from art_policy.multi_hypothesis import HypothesisBatch
 from art_policy.sequence import (
@@ -35,8 +37,10 @@ class HypothesisSet:
         dataset: Source; problems without a solved trajectory are left out.
         trajectories: Indices of the trajectories to use.
         table: Size of the table in m, for augmentation.
-        tails: Whether to add one problem that begins in flight for each problem: what is left of
-            one of its optima from a random node on, which is an optimum of what is left.
+        tails: Share of the problems of which one that begins in flight is added: what is left of
+            one of the optima from a random node on, which is an optimum of what is left.
+        max_discs: If given, augmentation adds discs to scenes that have fewer
+            (:meth:`.HypothesisBatch.with_decoys`).
         n_samples: Number ``S`` of equally spaced times at which a path is compared.
         max_optima: Most optima ``R`` of one problem that are used, cheapest first.
     """
@@ -46,7 +50,8 @@ class HypothesisSet:
         dataset: PackedDataset,
         trajectories: np.ndarray,
         table: tuple[float, float],
-        tails: bool = False,
+        tails: float = 0.0,
+        max_discs: int | None = None,
         n_samples: int = 64,
         max_optima: int = 4,
     ) -> None:
@@ -69,8 +74,18 @@ class HypothesisSet:
             torch.from_numpy(costs[usable]),
         )
         if tails:
-            batch = _joined(batch, _tails(dataset, chosen, n_optima, n_samples))
+            batch = _joined([batch, _tails(dataset, chosen, tails, n_optima, n_samples)])
         self._examples, self._table, self._dt = batch, table, dataset.dt
+        self._decoys = max_discs is not None
+        if max_discs is not None:
+            self._examples = _padded(batch, max_discs, n_optima)
+
+    @classmethod
+    def joined(cls, sets: Sequence[HypothesisSet]) -> HypothesisSet:
+        """The examples of several sets that were made with the same settings."""
+        whole = copy.copy(sets[0])
+        whole._examples = _joined([each._examples for each in sets])
+        return whole
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -79,7 +94,10 @@ class HypothesisSet:
         """The examples ``index``, each under a random symmetry if a ``generator`` is given."""
         every = self._examples
         examples = HypothesisBatch(every.problems[index], every.paths[index], every.costs[index])
-        return examples.augmented(self._table, self._dt, generator) if generator else examples
+        if generator is None:
+            return examples
+        examples = examples.augmented(self._table, self._dt, generator)
+        return examples.with_decoys(self._table, self._dt, generator) if self._decoys else examples
 
 
 #: Fewest steps that are left of a trajectory in a problem that begins in flight.
@@ -87,13 +105,13 @@ _SHORTEST_TAIL = 10
 
 
 def _tails(
-    dataset: PackedDataset, trajectories: np.ndarray, n_optima: int, n_samples: int
+    dataset: PackedDataset, trajectories: np.ndarray, share: float, n_optima: int, n_samples: int
 ) -> HypothesisBatch:
-    """What is left of one optimum of each problem from a random node on; seeded."""
+    """What is left of one optimum of a share of the problems from a random node on; seeded."""
     rng = np.random.default_rng(0)
     order = rng.permutation(trajectories)
     _, first = np.unique(np.asarray(dataset.problem_index)[order], return_index=True)
-    chosen = order[first]
+    chosen = order[first][rng.random(len(first)) < share]
     n_steps = np.diff(dataset.offsets)[chosen]
     begin = rng.integers(1, np.maximum(n_steps - _SHORTEST_TAIL, 2))
     paths = np.zeros((len(chosen), n_optima, n_samples, 3), dtype=np.float32)
@@ -119,15 +137,25 @@ def _tails(
     )
 
 
-def _joined(first: HypothesisBatch, second: HypothesisBatch) -> HypothesisBatch:
-    problems = (
-        torch.cat([getattr(first.problems, item.name), getattr(second.problems, item.name)])
-        for item in fields(ProblemBatch)
-    )
+def _padded(batch: HypothesisBatch, n_discs: int, n_optima: int) -> HypothesisBatch:
+    """The same with room for at least so many discs and optima."""
+    problems = batch.problems
+    more = max(n_discs - problems.discs.shape[1], 0)
+    discs = F.pad(problems.discs, (0, 0, 0, more))
+    more = max(n_optima - batch.costs.shape[1], 0)
+    paths = F.pad(batch.paths, (0, 0, 0, 0, 0, more))
+    costs = F.pad(batch.costs, (0, more), value=torch.inf)
+    return HypothesisBatch(replace(problems, discs=discs), paths, costs)
+
+
+def _joined(batches: Sequence[HypothesisBatch]) -> HypothesisBatch:
+    n_discs = max(batch.problems.discs.shape[1] for batch in batches)
+    n_optima = max(batch.costs.shape[1] for batch in batches)
+    batches = [_padded(batch, n_discs, n_optima) for batch in batches]
     return HypothesisBatch(
-        ProblemBatch(*problems),
-        torch.cat([first.paths, second.paths]),
-        torch.cat([first.costs, second.costs]),
+        ProblemBatch.joined([batch.problems for batch in batches]),
+        torch.cat([batch.paths for batch in batches]),
+        torch.cat([batch.costs for batch in batches]),
     )
 
 
@@ -156,6 +184,21 @@ class SequenceSet:
         self._controls = dataset.controls
         self._dt, self._robot = dataset.dt, dataset.robot
         self._table, self._length = table, length
+
+    @classmethod
+    def joined(cls, sets: Sequence[SequenceSet]) -> SequenceSet:
+        """The trajectories of several sets that were made with the same settings."""
+        if len(sets) == 1:
+            return sets[0]
+        whole = copy.copy(sets[0])
+        whole._problems = ProblemBatch.joined([each._problems for each in sets])
+        problems = np.cumsum([0, *(len(each._problems) for each in sets)]).tolist()
+        steps = np.cumsum([0, *(len(each._controls) for each in sets)]).tolist()
+        whole._slot = torch.cat([each._slot + n for each, n in zip(sets, problems)])
+        whole._first = torch.cat([each._first + n for each, n in zip(sets, steps)])
+        whole._n_steps = torch.cat([each._n_steps for each in sets])
+        whole._controls = np.concatenate([each._controls for each in sets])
+        return whole
 
     def __len__(self) -> int:
         return len(self._slot)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
+from functools import partial
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from art_policy.sequence import (
     reverse_controls,
 )
 from art_policy.training_data import HypothesisSet, SequenceSet, deviations
-from freeflyer_datasets.loading import PackedDataset
+from freeflyer_datasets.loading import PackedDataset, load_sample
 from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
 from freeflyer_env import constraints
 from freeflyer_env.planning import Trajectory, solve_scp, to_go
@@ -117,7 +118,7 @@ def test_augmented_paths_are_those_of_the_augmented_problems(dataset: PackedData
 def test_tails_are_solved_problems_that_begin_in_flight(dataset: PackedDataset) -> None:
     every = np.arange(len(dataset))
     without = HypothesisSet(dataset, every, (LENGTH, WIDTH))
-    training = HypothesisSet(dataset, every, (LENGTH, WIDTH), tails=True)
+    training = HypothesisSet(dataset, every, (LENGTH, WIDTH), tails=1.0)
     assert len(training) == 2 * len(without)
     tails = training.batch(torch.arange(len(without), len(training)), None)
     assert (tails.problems.start[:, 3:].norm(dim=1) > 0.0).all()
@@ -132,6 +133,55 @@ def test_tails_are_solved_problems_that_begin_in_flight(dataset: PackedDataset) 
         result = solve_scp(problem, Trajectory.from_poses(problem, line + away))
         assert result.solved
         assert result.cost == pytest.approx(float(tails.costs[row, 0]), rel=0.02, abs=1e-4)
+
+
+def test_decoys_leave_the_cheapest_optimum_what_it_is(dataset: PackedDataset) -> None:
+    every = np.arange(len(dataset))
+    index, most = torch.arange(24), 12
+    plain = HypothesisSet(dataset, every, (LENGTH, WIDTH))
+    training = HypothesisSet(dataset, every, (LENGTH, WIDTH), max_discs=most)
+    batch = training.batch(index, torch.Generator().manual_seed(3))
+    before = plain.batch(index, torch.Generator().manual_seed(3))
+    n_before = before.problems.present.sum(1)
+    assert batch.problems.discs.shape == (len(index), most, 5)
+    torch.testing.assert_close(batch.paths[:, 0], before.paths[:, 0])
+    torch.testing.assert_close(batch.costs[:, 0], before.costs[:, 0])
+    assert (batch.costs >= before.costs).all()  # some others are blocked, that is, infinite
+    assert (batch.problems.present.sum(1) > n_before + 2).float().mean() > 0.3
+    assert batch.problems.discs[..., 3:].any()
+    assert not training.batch(index, None).problems.present[:, n_before.max() :].any()
+    for row in range(0, len(index), 4):
+        problem = to_problem(batch.problems[torch.tensor([row])])
+        knots = batch.paths[row, 0].numpy()
+        share = np.linspace(0.0, 1.0, problem.n_steps)
+        at = np.linspace(0.0, 1.0, len(knots))
+        away = np.column_stack([np.interp(share, at, knots[:, axis]) for axis in range(3)])
+        line = problem.start[:3] + share[:, None] * (problem.goal[:3] - problem.start[:3])
+        result = solve_scp(problem, Trajectory.from_poses(problem, line + away))
+        assert result.solved
+        assert result.cost == pytest.approx(float(batch.costs[row, 0]), rel=0.01)
+
+
+def test_joined_sets_hold_the_examples_of_each(dataset: PackedDataset) -> None:
+    every = np.arange(len(dataset))
+    table, generator = (LENGTH, WIDTH), torch.Generator()
+    sample = load_sample("general-v0")
+    for make in (HypothesisSet, partial(SequenceSet, length=20)):
+        one = make(dataset, every, table)
+        other = make(sample, np.arange(60), table)
+        both = type(one).joined([one, other])
+        assert len(both) == len(one) + len(other)
+        for each, index in ((one, torch.arange(5)), (other, len(one) + torch.arange(5))):
+            mine = both.batch(index, None).problems
+            theirs = each.batch(torch.arange(5), None).problems
+            torch.testing.assert_close(mine.start, theirs.start)
+            torch.testing.assert_close(mine.final_time, theirs.final_time)
+            n = theirs.discs.shape[1]
+            torch.testing.assert_close(mine.discs[:, :n], theirs.discs)
+            assert not mine.discs[:, n:].any()
+        assert both.batch(torch.tensor([0, len(one)]), generator) is not None
+    joined, alone = both.batch(len(one) + torch.arange(5), None), other.batch(torch.arange(5), None)
+    torch.testing.assert_close(joined.controls, alone.controls)
 
 
 def test_hypothesis_set_holds_the_optima_cheapest_first(dataset: PackedDataset) -> None:
