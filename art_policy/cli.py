@@ -267,6 +267,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--final-time", type=float, nargs="+", default=[40.0], help="in s")
     sub.add_argument("--candidates", type=count, default=4, help="most candidates refined")
     sub.add_argument("--starts", type=count, default=13, help="starts for the best known solution")
+    text = "stop every SCP once its cost has settled to 0.5 mm/s (the paper: 1e-6 m/s)"
+    sub.add_argument("--quick", action="store_true", help=text)
     sub.add_argument("--workers", type=count)
     sub.add_argument("--out", help="JSON file for the report; with it the evaluation resumes")
     sub.add_argument("--figures", help="folder for figures")

@@ -62,6 +62,7 @@ def evaluate_models(options: argparse.Namespace) -> None:
     )
     from art_policy.evaluation.figures import figures
     from art_policy.model import load_model
+    from freeflyer_env.planning import SCPConfig
 
     for model in options.models:
         load_model(model)  # a wrong name is an error before the work begins
@@ -79,11 +80,12 @@ def evaluate_models(options: argparse.Namespace) -> None:
         ),
         options.candidates,
         options.starts,
+        SCPConfig.quick() if options.quick else SCPConfig(),
         options.workers,
         progress=not options.json,
         partial=partial,
     )
-    data = report(records, options.models)
+    data = report(records, options.models, quick=options.quick)
     if partial:
         save_report(data, Path(options.out))
         partial.unlink()

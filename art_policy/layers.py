@@ -11,6 +11,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from art_policy.envelope import Envelope
+
 HEADS = ("multi_hypothesis", "autoregressive")
 SCENE_DESCRIPTORS = ("relative", "absolute")
 
@@ -36,6 +38,7 @@ class ARTConfig:
             (paper, Sec. IV-C, question 3).
         predict_time_to_go: Autoregressive only: adds the time-to-go to the loss (the paper's FT
             loss).
+        envelope: Ranges of what the model was trained on; training fills it in.
     """
 
     head: str = "multi_hypothesis"
@@ -50,6 +53,7 @@ class ARTConfig:
     tokens_per_step: int = 4
     scene_descriptors: str = "relative"
     predict_time_to_go: bool = False
+    envelope: Envelope | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "table", tuple(float(side) for side in self.table))
@@ -101,7 +105,8 @@ class ARTConfig:
                 f"Unknown fields in the model's config.json: {sorted(unknown)}; "
                 "it was saved by a newer version."
             )
-        return cls(**data)
+        envelope = data.get("envelope")
+        return cls(**{**data, "envelope": envelope and Envelope.from_dict(envelope)})
 
 
 @dataclass

@@ -47,7 +47,8 @@ class PlannerConfig:
         n_candidates: How many of the model's proposals race (:func:`.race_scp`); the cheapest
             result is kept.
         rel: What becomes of REL, the classical warm start: ``"fallback"``, refined if no candidate
-            leads to a feasible plan; ``"portfolio"``, always refined too, so that the plan is never
+            leads to a feasible plan, or if the problem is unlike those that the model was trained
+            on; ``"portfolio"``, always refined too, so that the plan is never
             worse than REL + SCP; ``"never"``, to see what the model does alone. Unless ``"never"``,
             other homotopy classes are the last resort where REL fails, too.
         scp: Settings of the SCP loop. Its ``reroutes`` play no part for the model's candidates.
@@ -114,17 +115,17 @@ class WarmStartPlanner:
         Returns:
             The plan. Where every warm start failed its result says why; nothing is raised.
         """
-        search = _Search(problem, self.config)
+        role = "portfolio" if self.model is None else self.config.rel
+        search = _Search(problem, self.config, wants_rel=role == "portfolio")
         if problem.defects():
             line = straight_line(problem)
             search.attempts.append(("rel", line, solve_scp(problem, line, self.config.scp)))
             return search.finish()
         if self.model is not None:
             self._try_model(search)
-        role = "portfolio" if self.model is None else self.config.rel
         if (
             not search.attempts
-            or role == "portfolio"
+            or search.wants_rel
             or (role == "fallback" and not search.any_solved)
         ):
             search.refine_rel()
@@ -141,6 +142,10 @@ class WarmStartPlanner:
         if needs_rel and rel is None:
             search.monitor.append("REL failed, so there is no reward-to-go to ask the model for")
             return
+        envelope = self.model.config.envelope
+        if self.config.rel != "never" and envelope and (why := envelope.outside(search.problem)):
+            search.monitor.append(f"REL refined too: {why}")
+            search.wants_rel = True
         began = time.perf_counter()
         proposals = propose(self.model, search.problem, self.config.n_candidates, rel=rel)
         search.timings["propose"] = time.perf_counter() - began
@@ -171,8 +176,8 @@ class WarmStartPlanner:
 class _Search:
     """The attempts at one problem, with what they cost."""
 
-    def __init__(self, problem: Problem, config: PlannerConfig) -> None:
-        self.problem, self.config = problem, config
+    def __init__(self, problem: Problem, config: PlannerConfig, wants_rel: bool) -> None:
+        self.problem, self.config, self.wants_rel = problem, config, wants_rel
         self.began = time.perf_counter()
         self.timings = {"propose": 0.0, "rel": 0.0, "scp": 0.0}
         self.attempts: list[tuple[str, Trajectory, SCPResult]] = []

@@ -153,7 +153,7 @@ def random_flags(batch: int, generator: torch.Generator) -> Tensor:
 
 
 #: Random discs move in one problem of so many, at up to this speed in m/s, as in general-v0.
-_MOVING_SHARE, _DISC_SPEED = 0.25, 0.025
+_MOVING_SHARE, DISC_SPEED = 0.25, 0.025
 
 
 def random_discs(
@@ -166,7 +166,7 @@ def random_discs(
     x = 0.5 + (table[0] - 1.0) * draw[..., 1]
     y = radius + (table[1] - 2.0 * radius) * draw[..., 2]
     moving = torch.rand(shape[0], 1, generator=generator) < _MOVING_SHARE
-    speed, course = _DISC_SPEED * draw[..., 3] * moving, 2.0 * math.pi * draw[..., 4]
+    speed, course = DISC_SPEED * draw[..., 3] * moving, 2.0 * math.pi * draw[..., 4]
     keep_out = (radius + scenario.robot.radius) * scenario.keep_out_factor
     return torch.stack([x, y, keep_out, speed * course.cos(), speed * course.sin()], dim=2)
 

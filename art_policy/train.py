@@ -265,6 +265,7 @@ def train(
     training, validation = _examples(datasets, model_config, config)
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
+    model_config = dataclasses.replace(model_config, envelope=training.envelope)
     source = {"dataset": " + ".join(each.dataset_id for each in datasets)}
     state = _State.create(model_config, config, {**source, "examples": len(training)})
     if isinstance(state.model.net, Autoregressive) and isinstance(training, SequenceSet):
@@ -343,13 +344,13 @@ def _initialise(model: ART, name: str) -> None:
     other = ART.from_pretrained(name)
     ours, theirs = model.config.to_dict(), other.config.to_dict()
     changed = [key for key in ours if ours[key] != theirs[key]]
-    if set(changed) - {"n_hypotheses", "dropout"}:
+    if changed := sorted(set(changed) - {"n_hypotheses", "dropout", "envelope"}):
         raise ValueError(
             f"TrainConfig.init: {name!r} is of another {', '.join(changed)} than the model that is "
             "to be trained."
         )
     weights = other.state_dict()
-    if "n_hypotheses" in changed:
+    if ours["n_hypotheses"] != theirs["n_hypotheses"]:
         del weights["net.query_embedding"]
     model.load_state_dict(weights, strict=False)
 

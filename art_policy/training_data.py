@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from art_policy.envelope import Envelope
 from art_policy.multi_hypothesis import HypothesisBatch
 from art_policy.sequence import (
+    DISC_SPEED,
     MIRROR_CONTROL,
     ProblemBatch,
     SequenceBatch,
@@ -86,6 +88,20 @@ class HypothesisSet:
         whole = copy.copy(sets[0])
         whole._examples = _joined([each._examples for each in sets])
         return whole
+
+    @property
+    def envelope(self) -> Envelope | None:
+        """Ranges of the problems, with the discs that augmentation adds; None without problems."""
+        problems = self._examples.problems
+        if not len(problems):
+            return None
+        envelope = Envelope.of(problems)
+        if not self._decoys:
+            return envelope
+        counts = (envelope.n_obstacles[0], problems.discs.shape[1])
+        return replace(
+            envelope, n_obstacles=counts, obstacle_speed=max(envelope.obstacle_speed, DISC_SPEED)
+        )
 
     def __len__(self) -> int:
         return len(self._examples)
@@ -199,6 +215,11 @@ class SequenceSet:
         whole._n_steps = torch.cat([each._n_steps for each in sets])
         whole._controls = np.concatenate([each._controls for each in sets])
         return whole
+
+    @property
+    def envelope(self) -> Envelope | None:
+        """Ranges of the problems; None without problems."""
+        return Envelope.of(self._problems) if len(self._problems) else None
 
     def __len__(self) -> int:
         return len(self._slot)

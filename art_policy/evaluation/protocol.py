@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -163,6 +163,7 @@ def evaluate_problem(
     problem: Problem,
     n_candidates: int,
     n_starts: int,
+    config: SCPConfig | None = None,
 ) -> ProblemRecord:
     """Runs every method on one problem.
 
@@ -178,31 +179,36 @@ def evaluate_problem(
         problem: What to solve.
         n_candidates: Most candidates of a model that are refined.
         n_starts: Starts of multi-start, REL's included, that the best known solution is taken from.
+        config: Settings of the SCP that all methods share; the paper's if None.
     """
-    rel = solve_rel(problem)
+    config = config or SCPConfig()
+    rel = solve_rel(problem, config)
     bound = rel.trajectory
     c_rel = int(bound.violations(problem).sum()) if bound is not None else -1
     outcomes = {
-        "REL": _timed(lambda: solve_scp(problem)),
-        "REL, elastic": _timed(lambda: solve_scp(problem, config=SCPConfig(elastic=True))),
+        "REL": _timed(lambda: solve_scp(problem, config=config)),
+        "REL, elastic": _timed(lambda: solve_scp(problem, config=replace(config, elastic=True))),
     }
     for name, model in models.items():
         most = n_candidates
         if model.config.head == "multi_hypothesis":
             most = min(most, model.config.n_hypotheses)
         settings = {
-            name: PlannerConfig(1, "never"),
-            f"{name}, best of {most}": PlannerConfig(most, "never"),
-            f"{name}, best of {most} and REL": PlannerConfig(most, "portfolio"),
+            name: PlannerConfig(1, "never", config),
+            f"{name}, best of {most}": PlannerConfig(most, "never", config),
+            f"{name}, best of {most} and REL": PlannerConfig(most, "portfolio", config),
         }
         if most == 1:
             del settings[f"{name}, best of 1"]
-        for label, config in settings.items():
-            plan = WarmStartPlanner(model, config).plan(problem)
+        for label, setting in settings.items():
+            plan = WarmStartPlanner(model, setting).plan(problem)
             outcomes[label] = _outcome(plan.result, plan.timings["total"])
     budget = max((o.time for label, o in outcomes.items() if "best of" in label), default=0.0)
     counts = sorted({*_MULTI_START, min(8, n_starts), n_starts})
-    raced = {count: _timed(lambda: _multi_start(problem, count)) for count in counts}  # noqa: B023
+    raced = {
+        count: _timed(lambda: _multi_start(problem, count, config))  # noqa: B023
+        for count in counts
+    }
     for count in _MULTI_START:
         outcomes[f"multi-start, best of {count}"] = raced[count]
     if budget:
@@ -213,13 +219,13 @@ def evaluate_problem(
     return ProblemRecord(scene, index, problem.final_time, size, c_rel, rel.cost, best, outcomes)
 
 
-def _multi_start(problem: Problem, n_starts: int) -> SCPResult:
+def _multi_start(problem: Problem, n_starts: int, config: SCPConfig) -> SCPResult:
     """The best that a race from REL and other homotopy classes leads to."""
-    rel = solve_rel(problem)
+    rel = solve_rel(problem, config)
     if problem.defects():
         return rel
     starts = [rel.trajectory or straight_line(problem), *homotopy_starts(problem, n_starts - 1)]
-    return min(race_scp(problem, starts), key=lambda result: result.cost)
+    return min(race_scp(problem, starts, config), key=lambda result: result.cost)
 
 
 def _timed(solve: Callable[[], SCPResult]) -> Outcome:

@@ -7,6 +7,7 @@ import functools
 import hashlib
 import json
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from art_policy.evaluation.protocol import ProblemRecord, evaluate_problem
 from art_policy.evaluation.statistics import finite
+from freeflyer_env.planning import SCPConfig
 from freeflyer_env.sampling import sample_problem
 from freeflyer_env.scenario import Problem, Scenario
 
@@ -23,6 +25,8 @@ if TYPE_CHECKING:
 
 Problems = Sequence[tuple[str, int, Problem]]
 
+_Settings = tuple[int, int, SCPConfig]  # most candidates, most starts, settings of SCP
+
 _CHUNK = 10  # problems a process takes at once
 
 
@@ -31,6 +35,7 @@ def evaluate(
     problems: Problems,
     n_candidates: int = 4,
     n_starts: int = 13,
+    config: SCPConfig | None = None,
     workers: int | None = None,
     progress: bool = True,
     partial: Path | None = None,
@@ -43,6 +48,7 @@ def evaluate(
         problems: As :func:`evaluation_problems` gives them.
         n_candidates: Largest number of candidates, at most as many as a model has hypotheses.
         n_starts: Starts of multi-start that the best known solution is taken from.
+        config: Settings of the SCP that all methods share; the paper's if None.
         workers: Processes; one per processor if None.
         progress: Whether to show a progress bar.
         partial: File that collects the records on the way (JSON lines). What is in it already is
@@ -65,7 +71,8 @@ def evaluate(
     if len(set(names)) < len(names):
         raise ValueError(f"The models must have different names, got {', '.join(names)}.")
     stamped = tuple((name, str(model), _stamp(model)) for name, model in zip(names, given))
-    done = _Journal(partial, _fingerprint(stamped, problems, n_candidates, n_starts))
+    settings = (n_candidates, n_starts, config or SCPConfig())
+    done = _Journal(partial, _fingerprint(stamped, problems, settings))
     todo = [item for item in problems if item[1] not in done.records]
     chunks = [todo[i : i + _CHUNK] for i in range(0, len(todo), _CHUNK)]
     with (
@@ -73,10 +80,7 @@ def evaluate(
         tqdm(total=len(problems), initial=len(problems) - len(todo), unit="problem",
              disable=not progress) as bar,
     ):  # fmt: skip
-        jobs = (
-            joblib.delayed(_evaluate_chunk)(stamped, chunk, n_candidates, n_starts)
-            for chunk in chunks
-        )
+        jobs = (joblib.delayed(_evaluate_chunk)(stamped, chunk, settings) for chunk in chunks)
         for records in joblib.Parallel(n_jobs=workers or -1, return_as="generator")(jobs):
             done.add(records)
             bar.update(len(records))
@@ -120,13 +124,13 @@ class _Journal:
 
 
 def _fingerprint(
-    models: tuple[tuple[str, str, str], ...], problems: Problems, n_candidates: int, n_starts: int
+    models: tuple[tuple[str, str, str], ...], problems: Problems, settings: _Settings
 ) -> str:
     content = [
         [(name, stamp) for name, _, stamp in models],
         [(scene, index, problem.to_dict()) for scene, index, problem in problems],
-        n_candidates,
-        n_starts,
+        *settings[:2],
+        asdict(settings[2]),
     ]
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()
 
@@ -145,15 +149,14 @@ def _stamp(model: str | Path) -> str:
 def _evaluate_chunk(
     stamped: tuple[tuple[str, str, str], ...],
     chunk: list[tuple[str, int, Problem]],
-    n_candidates: int,
-    n_starts: int,
+    settings: _Settings,
 ) -> list[ProblemRecord]:
     with _one_thread():
         models = {name: _load(path, stamp) for name, path, stamp in stamped}
         records = []
         for scene, index, problem in chunk:
             _warm_up(stamped, problem.n_steps, len(problem.scenario.obstacles))
-            records.append(evaluate_problem(models, scene, index, problem, n_candidates, n_starts))
+            records.append(evaluate_problem(models, scene, index, problem, *settings))
         return records
 
 

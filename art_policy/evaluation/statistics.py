@@ -117,8 +117,16 @@ def _improvements(
     return result
 
 
-def report(records: Sequence[ProblemRecord], model: str | Sequence[str]) -> dict[str, Any]:
-    """What ``freeflyer evaluate`` writes to JSON: figures for all problems and by group."""
+def report(
+    records: Sequence[ProblemRecord], model: str | Sequence[str], **settings: Any
+) -> dict[str, Any]:
+    """What ``freeflyer evaluate`` writes to JSON: figures for all problems and by group.
+
+    Args:
+        records: Of all problems.
+        model: The models' names.
+        settings: What else should be known about the evaluation.
+    """
     groups = {"all": list(records)}
     for scene in sorted({r.scene for r in records}):
         groups[f"scene {scene}"] = [r for r in records if r.scene == scene]
@@ -133,6 +141,7 @@ def report(records: Sequence[ProblemRecord], model: str | Sequence[str]) -> dict
         groups[f"T_f = {final_time:g} s"] = [r for r in records if r.final_time == final_time]
     return {
         "model": model if isinstance(model, str) else list(model),
+        "settings": settings,
         "machine": {"processor": platform.machine(), "python": platform.python_version()},
         "paper": PAPER,
         "groups": {name: summarise(group) for name, group in groups.items() if group},

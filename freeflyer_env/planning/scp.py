@@ -73,6 +73,15 @@ class SCPConfig:
     time_limit: float = np.inf
 
     @classmethod
+    def quick(cls, **settings: Any) -> SCPConfig:
+        """Settings that stop once the cost has settled to 0.5 mm/s, some 0.2 % of it.
+
+        By then the trajectory has long been feasible; what the iterations after it save is measured
+        in ``docs/planning.md``.
+        """
+        return cls(**{"cost_tolerance": 5e-4, **settings})
+
+    @classmethod
     def robust(cls, **settings: Any) -> SCPConfig:
         """Settings to fly with: elastic, rerouted, and clear of obstacles between the nodes too."""
         return cls(**{"between_nodes": True, "elastic": True, "reroutes": 12, **settings})

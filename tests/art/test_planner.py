@@ -1,12 +1,15 @@
 """The planner, its monitor and the wrapper."""
 
 import dataclasses
+import json
 
 import gymnasium as gym
 import numpy as np
 import pytest
 
 from art_policy import ART, PlannerConfig, PlannerWrapper, WarmStartPlanner
+from art_policy.envelope import Envelope
+from art_policy.layers import ARTConfig
 from art_policy.planner import distrust
 from freeflyer_env import HELD_OUT_SCENES, Obstacles, Problem, Scenario, sample_problem
 from freeflyer_env.planning import (
@@ -57,6 +60,32 @@ def test_a_portfolio_is_never_worse_than_rel(model, problems):
         plan = planner.plan(problem)
         assert plan.result.cost <= solve_scp(problem).cost
         assert plan.iterations >= plan.result.iterations
+
+
+def test_outside_of_its_training_a_model_is_not_left_alone(model, problems):
+    problem = problems[0]
+    config = dataclasses.replace(model.config, envelope=Envelope((40.0, 40.0), (4, 4), 0.0, 0.0))
+    envelope = config.envelope
+    assert ARTConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
+    assert envelope.outside(problem) is None
+    moving = Obstacles([[1.0, 1.0]] * 4, [0.1] * 4, velocities=[[0.01, 0.0]] * 4)
+    flying = problem.start + np.array([0.0, 0.0, 0.0, 0.02, 0.0, 0.0])
+    others = {
+        "final time, 60 s, is not in the 40 to 40 s": {"final_time": 60.0},
+        "number of obstacles, 0, ": {"scenario": Scenario(Obstacles.from_rows([]))},
+        "speed of the obstacles, 0.01 m/s, ": {"scenario": Scenario(moving)},
+        "speed at start or goal, 0.02 m/s, ": {"start": flying},
+    }
+    for text, changes in others.items():
+        assert text in envelope.outside(dataclasses.replace(problem, **changes))
+    known = ART(config).eval()
+    known.load_state_dict(model.state_dict())
+    other = dataclasses.replace(problem, final_time=60.0)
+    plan = WarmStartPlanner(known).plan(other)
+    assert any(line.startswith("REL refined too: the final time") for line in plan.monitor)
+    assert plan.result.cost <= solve_scp(other).cost
+    alone = WarmStartPlanner(known, PlannerConfig(rel="never")).plan(other)
+    assert not any("REL" in line for line in alone.monitor)
 
 
 def test_proposals_are_warm_starts_for_re_planning(model, problems):

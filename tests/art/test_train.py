@@ -13,6 +13,8 @@ import torch
 
 from art_policy import train as train_module
 from art_policy.layers import ARTConfig
+from art_policy.model import ART
+from art_policy.sequence import DISC_SPEED
 from art_policy.train import CHECKPOINT_NAME, LOG_NAME, TrainConfig, train
 from freeflyer_datasets.loading import PackedDataset
 
@@ -81,6 +83,22 @@ def test_sequences_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) ->
     rows = [row for row in log_of(tmp_path) if "lr" in row]
     assert rows[-1]["control_loss"] < 0.4
     assert rows[-1]["state_loss"] < 0.05
+
+
+def test_a_model_knows_what_it_was_trained_on(dataset: PackedDataset, tmp_path: Path) -> None:
+    train(dataset, TINY, replace(SHORT, max_steps=1), tmp_path)
+    envelope = ART.from_pretrained(tmp_path).config.envelope
+    assert envelope is not None
+    assert envelope.final_time == (30.0, 40.0)
+    assert envelope.n_obstacles == (2, 4)
+    assert 0.01 < envelope.obstacle_speed <= 0.02
+    assert envelope.end_speed > 0.05  # of the problems that begin in flight
+    more = replace(SHORT, max_steps=1, max_discs=6, init=str(tmp_path))
+    train([dataset, dataset], replace(TINY, n_hypotheses=5), more, tmp_path / "more")
+    envelope = ART.from_pretrained(tmp_path / "more").config.envelope
+    assert envelope is not None
+    assert envelope.n_obstacles == (2, 6)
+    assert envelope.obstacle_speed == DISC_SPEED
 
 
 def test_validation_problems_are_never_trained_on(dataset: PackedDataset) -> None:
