@@ -27,7 +27,7 @@ def train_model(options: argparse.Namespace) -> None:
     length = {"max_minutes": options.minutes, "max_steps": options.steps, "seed": options.seed}
     config = configure(TrainConfig, "--train-config", options.train_config, **length)
     check_out(options.out, ())
-    datasets = [_dataset(name) for name in options.datasets]
+    datasets = [open_dataset(name) for name in options.datasets]
     model = train(datasets, model_config, config, options.out)
     text = f"{model.num_parameters:,} parameters in {options.out}; now: freeflyer evaluate"
     print_result(
@@ -41,7 +41,8 @@ def train_model(options: argparse.Namespace) -> None:
     )
 
 
-def _dataset(name: str) -> PackedDataset:
+def open_dataset(name: str) -> PackedDataset:
+    """The packed form of a dataset by its Minari id, or of a folder of shards or packed arrays."""
     from freeflyer_datasets import PackedDataset
 
     folder = Path(name)
@@ -61,6 +62,7 @@ def evaluate_models(options: argparse.Namespace) -> None:
         save_report,
     )
     from art_policy.evaluation.figures import figures
+    from art_policy.figures import one_obstacle_moves
     from art_policy.model import load_model
     from freeflyer_env.planning import SCPConfig
 
@@ -89,7 +91,12 @@ def evaluate_models(options: argparse.Namespace) -> None:
     if partial:
         save_report(data, Path(options.out))
         partial.unlink()
-    drawn = [str(path) for path in figures(data, Path(options.figures))] if options.figures else []
+    drawn = []
+    if options.figures:
+        folder = Path(options.figures)
+        models = {Path(name).name: load_model(name) for name in options.models}
+        drawn = [str(path) for path in figures(data, folder)]
+        drawn.append(str(one_obstacle_moves(models, folder / "one_obstacle_moves.png")))
     groups = data["groups"]
     summary = {"models": options.models, "groups": groups, "out": options.out, "figures": drawn}
     text = "\n\n".join(

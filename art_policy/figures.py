@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from freeflyer_env.planning import solve_rel
-from freeflyer_env.scenario import Problem
+from art_policy.rollout import propose
+from freeflyer_env.planning import solve_rel, solve_scp
+from freeflyer_env.scenario import Obstacles, Problem, Scenario
 
 if TYPE_CHECKING:
+    from art_policy.deployment import OnnxART
+    from art_policy.model import ART
     from art_policy.planner import Plan
     from freeflyer_env.control import Flight
 
@@ -61,6 +66,48 @@ def plan_and_flight(problem: Problem, plan: Plan, flight: Flight, path: str | Pa
     velocity.grid(alpha=0.3)
     velocity.legend(frameon=False)
     figure.savefig(path, dpi=110, bbox_inches="tight")
+
+
+def one_obstacle_moves(
+    models: Mapping[str, ART | OnnxART], path: str | Path, n_panels: int = 5
+) -> Path:
+    """What models propose as one obstacle is put elsewhere (paper, Fig. 2).
+
+    The obstacle crosses the way from start to goal; each panel shows REL, every model's first
+    candidate (dashed), and what SCP makes of it.
+
+    Args:
+        models: By the name under which they are shown.
+        path: Picture file to write.
+        n_panels: Number of places of the obstacle.
+    """
+    from matplotlib.figure import Figure
+
+    scene = Scenario.named("held-out-1")
+    start, goal = np.zeros(6), np.zeros(6)
+    start[:2], goal[:2] = (0.25, 1.25), (3.25, 1.25)
+    figure = Figure(figsize=(3.0 * n_panels, 2.9), layout="constrained")
+    for axis, y in zip(figure.subplots(1, n_panels), np.linspace(0.75, 1.75, n_panels)):
+        rows = scene.obstacles.rows()
+        rows[np.argmin(np.abs(rows[:, 0] - 1.75)), :2] = 1.75, y
+        scenario = replace(scene, obstacles=Obstacles.from_rows(rows))
+        problem = Problem(scenario, start, goal, 40.0)
+        _draw_table(axis, problem)
+        rel = solve_rel(problem).trajectory
+        if rel is not None:
+            axis.plot(*rel.states[:, :2].T, color="0.6", lw=1.0, ls=":", label="REL")
+        for (name, model), color in zip(models.items(), ("#1f6fb4", "#ec7a1c", "#2c9660")):
+            warm_start = propose(model, problem, rel=rel)[0].trajectory
+            axis.plot(*warm_start.states[:, :2].T, "--", color=color, lw=1.0, label=name)
+            refined = solve_scp(problem, warm_start)
+            if refined.solved and refined.trajectory is not None:
+                label = f"SCP from {name}"
+                axis.plot(*refined.trajectory.states[:, :2].T, color=color, lw=1.8, label=label)
+        axis.set(xlabel="", ylabel="")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False, fontsize=8)
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+    return Path(path)
 
 
 def fly_and_film(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 from pathlib import Path
 
@@ -23,6 +24,22 @@ def test_snippets_run(page, tmp_path, monkeypatch):
     namespace: dict[str, object] = {"__name__": "guide"}
     for number, snippet in enumerate(snippets):
         exec(compile(snippet, f"{page.name}, snippet {number}", "exec"), namespace)
+
+
+def test_tables_are_those_of_the_evaluations():
+    spec = importlib.util.spec_from_file_location("tables", ROOT / "docs" / "tables.py")
+    assert spec
+    assert spec.loader
+    tables = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tables)
+    shown = 0
+    for page in tables.PAGES:
+        text = page.read_text(encoding="utf-8")
+        shown += text.count("<!-- table:")
+        assert tables.filled(text) == text, f"{page}: run python docs/tables.py"
+    assert shown
+    with pytest.raises(ValueError, match="no method 'RELL'"):
+        tables.filled(re.sub(r"\| REL;", "| RELL;", (ROOT / "README.md").read_text()))
 
 
 def test_links_point_to_files():

@@ -1,0 +1,277 @@
+"""What matters for the multi-hypothesis model: variants of it, each trained for as many steps.
+
+``python -m benchmarks.tries DATASET --out FOLDER`` trains every variant (resumable: what is there
+is kept), then compares them all in one evaluation on held-out and on random scenes, and writes
+``tries.json`` and a Markdown table. One variant replaces the head by flow matching, the usual
+generative baseline. ``DATASET`` is a Minari id or a folder of shards.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from art_policy.cli_models import open_dataset
+from art_policy.evaluation import evaluation_problems
+from art_policy.evaluation.protocol import evaluate_problem
+from art_policy.evaluation.statistics import finite, summarise
+from art_policy.layers import ARTConfig, Block, Decoder, Encoder, initialise
+from art_policy.model import ART
+from art_policy.multi_hypothesis import (
+    HypothesisBatch,
+    HypothesisLoss,
+    MultiHypothesis,
+    disc_features,
+    interpolation_matrix,
+    problem_features,
+)
+from art_policy.sequence import ProblemBatch
+from art_policy.train import LOG_NAME, TrainConfig, train
+from freeflyer_datasets import PackedDataset
+
+#: Name, problems, changes of the model, changes of the loss, changes of the training.
+VARIANTS: list[tuple[str, int, dict[str, Any], dict[str, Any], dict[str, Any]]] = [
+    ("base: 30,000 problems, 6 hypotheses, 20 knots, width 192", 30_000, {}, {}, {}),
+    ("3,000 problems", 3_000, {}, {}, {}),
+    ("10,000 problems", 10_000, {}, {}, {}),
+    ("100,000 problems", 100_000, {}, {}, {}),
+    ("1 hypothesis", 30_000, {"n_hypotheses": 1}, {}, {}),
+    ("3 hypotheses", 30_000, {"n_hypotheses": 3}, {}, {}),
+    ("12 hypotheses", 30_000, {"n_hypotheses": 12}, {}, {}),
+    ("10 knots", 30_000, {"n_knots": 10}, {}, {}),
+    ("40 knots", 30_000, {"n_knots": 40}, {}, {}),
+    ("width 96", 30_000, {"width": 96}, {}, {}),
+    ("width 288", 30_000, {"width": 288}, {}, {}),
+    ("the cheapest optimum alone as label", 30_000, {}, {"others_weight": 0.0}, {}),
+    ("all optima count the same", 30_000, {}, {"others_weight": 1.0}, {}),
+    ("no pull on idle hypotheses", 30_000, {}, {"idle_weight": 0.0}, {}),
+    ("sharper scores", 30_000, {}, {"cost_temperature": 0.005}, {}),
+    ("no symmetries", 30_000, {}, {}, {"augment": False}),
+    ("a fourth of the examples begins in flight", 30_000, {}, {}, {"tails": 0.25}),
+    ("discs added where they change no optimum", 30_000, {}, {}, {"max_discs": 8}),
+]
+FLOW = "flow matching, 8 steps"
+
+
+class FlowMatching(nn.Module):
+    """Paths by conditional flow matching: a velocity field from noise to deviations at knots.
+
+    The trunk is that of the multi-hypothesis head; each query embeds a noisy path and its time.
+    Samples are drawn from fixed noise and carry no scores.
+    """
+
+    _STEPS = 8
+
+    def __init__(self, config: ARTConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.problem_encoder = Encoder(20, config.width)
+        self.disc_encoder = Encoder(14, config.width)
+        self.path_encoder = Encoder(3 * config.n_knots + 1, config.width)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.n_layers))
+        self.velocity_decoder = Decoder(config.width, 3 * config.n_knots)
+        initialise(self, config.n_layers)
+        self.register_buffer("scale", torch.tensor([0.25, 0.25, 0.5]))
+        noise = torch.randn(
+            config.n_hypotheses, config.n_knots, 3, generator=torch.Generator().manual_seed(0)
+        )
+        self.register_buffer("noise", noise)
+
+    @property
+    def net(self) -> FlowMatching:
+        """What :func:`.propose` looks at to tell the heads apart."""
+        return self
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.noise.device
+
+    def velocity(self, problems: ProblemBatch, paths: Tensor, time: Tensor) -> Tensor:
+        """Velocity of noisy normalised paths ``(B, Q, n_knots, 3)`` at times ``(B, Q)``."""
+        size = paths.shape[1]
+        tokens = torch.cat(
+            [
+                self.path_encoder(torch.cat([paths.flatten(2), time[..., None]], dim=2)),
+                self.problem_encoder(problem_features(problems, self.config.table))[:, None],
+                self.disc_encoder(disc_features(problems, self.config.table)),
+            ],
+            dim=1,
+        )
+        # Samples of one problem must not see one another.
+        mask = torch.ones(tokens.shape[1], tokens.shape[1], dtype=torch.bool)
+        mask[:size, :size] = torch.eye(size, dtype=torch.bool)
+        mask[size:, :size] = False
+        for block in self.blocks:
+            tokens = block(tokens, mask=mask)
+        return self.velocity_decoder(tokens[:, :size]).view(paths.shape)
+
+    def loss(self, batch: HypothesisBatch, generator: torch.Generator) -> Tensor:
+        """Squared error of the velocity along the straight way from noise to the best optimum."""
+        matrix = interpolation_matrix(self.config.n_knots, batch.paths.shape[2])
+        target = torch.linalg.lstsq(matrix.expand(len(batch), -1, -1), batch.paths[:, 0]).solution
+        target = (target / self.scale)[:, None].expand(-1, 4, -1, -1)
+        noise = torch.randn(target.shape, generator=generator)
+        time = torch.rand(target.shape[:2], generator=generator)
+        paths = noise + time[..., None, None] * (target - noise)
+        return (self.velocity(batch.problems, paths, time) - (target - noise)).square().mean()
+
+    def forward(self, problems: ProblemBatch) -> tuple[Tensor, Tensor]:
+        """Deviations at the knots ``(B, H, n_knots, 3)``, and no opinion on them ``(B, H)``."""
+        paths = self.noise.expand(len(problems), -1, -1, -1)
+        for step in range(self._STEPS):
+            time = torch.full(paths.shape[:2], step / self._STEPS)
+            paths = paths + self.velocity(problems, paths, time) / self._STEPS
+        return paths * self.scale, torch.zeros(paths.shape[:2])
+
+
+def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> FlowMatching:
+    """Trains the baseline on the first 30,000 problems."""
+    from art_policy.training_data import HypothesisSet
+
+    torch.manual_seed(0)
+    model, path = FlowMatching(ARTConfig()), folder / "flow.pt"
+    if path.is_file():
+        model.load_state_dict(torch.load(path, weights_only=True))
+        return model.eval()
+    training = HypothesisSet(data, first_problems(data, 30_000), model.config.table)
+    assert config.max_steps
+    optimizer = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=0.05)
+    average = [p.detach().clone() for p in model.parameters()]
+    generator = torch.Generator().manual_seed(0)
+    for step in range(config.max_steps):
+        for group in optimizer.param_groups:
+            group["lr"] = config.rate(step / config.max_steps)
+        index = torch.randint(len(training), (config.batch_size,), generator=generator)
+        with torch.autocast("cpu", torch.bfloat16):
+            loss = model.loss(training.batch(index, generator), generator)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
+        optimizer.step()
+        optimizer.zero_grad()
+        torch._foreach_lerp_(average, [p.detach() for p in model.parameters()], 0.005)
+    with torch.no_grad():
+        for parameter, value in zip(model.parameters(), average):
+            parameter.copy_(value)
+    torch.save(model.state_dict(), path)
+    return model.eval()
+
+
+def first_problems(data: PackedDataset, count: int) -> np.ndarray:
+    """Training trajectories of the first problems."""
+    training = data.split()[0]
+    return training[np.asarray(data.problem_index)[training] < count]
+
+
+class _First(PackedDataset):
+    """The first problems of a dataset, with the same validation problems as the whole."""
+
+    limit: int = 0
+
+    def split(self, validation_fraction: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+        training, validation = super().split(validation_fraction)
+        return training[np.asarray(self.problem_index)[training] < self.limit], validation
+
+
+def first(data: PackedDataset, count: int) -> PackedDataset:
+    """A view of the first problems for :func:`train`."""
+    values = {field.name: getattr(data, field.name) for field in dataclasses.fields(data)}
+    part = _First(**values)
+    object.__setattr__(part, "limit", count)
+    return part
+
+
+def train_variant(data: PackedDataset, index: int, config: TrainConfig, folder: Path) -> ART:
+    """Trains one variant, or opens it if it is there."""
+    _, count, model, loss, changes = VARIANTS[index]
+    out = folder / f"variant-{index:02d}"
+    config = dataclasses.replace(config, **changes)
+    MultiHypothesis.loss.__defaults__ = (HypothesisLoss(**loss),)
+    return train(first(data, count), dataclasses.replace(ARTConfig(), **model), config, out)
+
+
+def last_validation(folder: Path) -> dict[str, float]:
+    """The figures of the last validation in a log."""
+    lines = [json.loads(line) for line in (folder / LOG_NAME).read_text().splitlines()]
+    return next((line for line in reversed(lines) if "val_loss" in line), {})
+
+
+def main() -> None:
+    """Trains, evaluates, prints."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("dataset")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--steps", type=int, default=1250)
+    parser.add_argument("--problems", type=int, default=300, help="of each kind")
+    parser.add_argument("--variants", type=int, nargs="+", default=list(range(len(VARIANTS))))
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    data = open_dataset(options.dataset)
+    config = TrainConfig(
+        max_steps=options.steps, threads=options.threads, tails=0.0, ema_decay=0.995
+    )
+    models: dict[str, Any] = {}
+    rows: dict[str, dict[str, Any]] = {}
+    for index in options.variants:
+        name = VARIANTS[index][0]
+        models[name] = train_variant(data, index, config, options.out)
+        figures = last_validation(options.out / f"variant-{index:02d}")
+        rows[name] = {
+            key: figures.get(f"val_{key}", math.nan)
+            for key in ("distance", "chosen_distance", "agreement", "regret")
+        }
+        print(f"trained: {name} {rows[name]}", flush=True)
+    models[FLOW] = train_flow(data, config, options.out)
+    rows[FLOW] = {}
+    torch.set_num_threads(1)
+    for scenes in ("held-out", "random"):
+        records = []
+        for scene, number, problem in evaluation_problems(options.problems, scenes, seed=3):
+            records.append(evaluate_problem(models, scene, number, problem, 4, 13))
+        groups = summarise(records)
+        for name in models:
+            four = f"{name}, best of {min(4, models[name].config.n_hypotheses)}"
+            four = four if four in groups else name
+            for kind, key in (("first", name), ("best of 4", four)):
+                rows[name][f"{scenes}, {kind}"] = groups[key]
+        rows.setdefault("best known", {})[f"{scenes}, first"] = groups["best known"]
+        rows.setdefault("REL", {})[f"{scenes}, first"] = groups["REL"]
+    content = {"steps": options.steps, "problems": options.problems, "variants": rows}
+    content["made"] = time.strftime("%Y-%m-%d")
+    path = options.out / "tries.json"
+    path.write_text(json.dumps(finite(content), indent=1) + "\n", encoding="utf-8")
+    print(table(rows))
+
+
+def table(rows: dict[str, dict[str, Any]]) -> str:
+    """The comparison as a Markdown table."""
+    lines = [
+        "| variant | distance, first | held-out: infeasible | improvement, 1 and 4 | iterations "
+        "| random: infeasible | improvement, 1 and 4 |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for name, row in rows.items():
+        cells = [name, f"{1e3 * row.get('chosen_distance', math.nan):.0f} mm"]
+        for scenes in ("held-out", "random"):
+            one = row[f"{scenes}, first"]
+            four = row.get(f"{scenes}, best of 4", one)
+            gain = ", ".join(f"{x['suboptimality_improvement']:+.1%}" for x in (one, four))
+            cells += [f"{one['infeasible_rate']:.1%}", gain]
+            if scenes == "held-out":
+                cells.append(f"{one['mean_iterations']:.2f}")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,64 @@
+"""Writes the tables of the pages from the evaluations in ``docs/results``.
+
+``python docs/tables.py`` does it; a test sees to it that it was done.
+A page says where a table comes from in a comment, and this script fills in what is behind it::
+
+    <!-- table: docs/results/held_out.json | all | REL; ART; ART, best of 4 -->
+    ...
+    <!-- end of table -->
+
+that is a report of ``freeflyer evaluate``, a group of its problems, and the methods to show.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+
+from art_policy.evaluation import markdown_table
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *sorted((ROOT / "art_policy" / "pretrained").glob("*/README.md")),
+]
+_TABLE = re.compile(r"(<!-- table: (.*?) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+
+
+def filled(page: str) -> str:
+    """The text of a page with its tables made anew.
+
+    Raises:
+        ValueError: If a report has no such group or method.
+    """
+    return _TABLE.sub(lambda match: match[1] + _table(match[2]) + match[3], page)
+
+
+def _table(source: str) -> str:
+    path, group, methods = (part.strip() for part in source.split("|"))
+    groups = json.loads((ROOT / path).read_text(encoding="utf-8"))["groups"]
+    if group not in groups:
+        raise ValueError(f"{path} has no group {group!r}, only {', '.join(groups)}.")
+    rows = {}
+    for method in (name.strip() for name in methods.split(";")):
+        if method not in groups[group]:
+            raise ValueError(f"{path} has no method {method!r}, only {'; '.join(groups[group])}.")
+        row = groups[group][method]
+        rows[method] = {key: math.nan if row[key] is None else row[key] for key in row}
+    return f"\n{markdown_table(rows)}\n\n"
+
+
+def main() -> None:
+    """Fills in the tables of all pages."""
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        if (new := filled(text)) != text:
+            page.write_text(new, encoding="utf-8")
+            print(f"wrote {page.relative_to(ROOT)}")
+
+
+if __name__ == "__main__":
+    main()
