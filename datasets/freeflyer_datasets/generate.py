@@ -250,7 +250,7 @@ def _solve(recipe: Recipe, problem: Problem) -> list[dict[str, Any]]:
     from freeflyer_env.planning import SCPConfig, solve_multistart
 
     config = SCPConfig(time_limit=_TIME_LIMIT)
-    found = solve_multistart(problem, recipe.n_starts, config, first_only=recipe.optima == "first")
+    found = solve_multistart(problem, recipe.n_starts, config, effort=recipe.optima)
     if found.rel.trajectory is None:
         return []
     records = [_record(problem, found.rel, LABEL_REL, rank=0, start_number=-1)]

@@ -61,7 +61,7 @@ class Recipe:
             each problem; random scenes only. Each obstacle moves uniformly in a random direction.
         final_times: Final times in s, drawn uniformly.
         n_starts: Warm starts that SCP is started from; the first one is the relaxed solution.
-        optima: ``"all"`` keeps every distinct local optimum, ``"best"`` the cheapest,
+        optima: ``"all"`` keeps every distinct local optimum, ``"best"`` the cheapest of a race,
             ``"first"`` that of the first start that is solved: SCP from REL as in the paper, and
             other starts only where that fails; about four times as fast.
 

@@ -20,6 +20,9 @@ from freeflyer_env.planning.scp import (
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.scenario import Problem
 
+#: What :func:`solve_multistart` does with its starts.
+EFFORTS = ("all", "best", "first")
+
 #: Two optima are the same if their costs and positions agree to these (m/s, m).
 _SAME_COST, _SAME_POSITION = 1e-4, 0.02
 
@@ -54,7 +57,7 @@ def solve_multistart(
     n_starts: int = 6,
     config: SCPConfig | None = None,
     n_jobs: int = 1,
-    first_only: bool = False,
+    effort: str = "all",
 ) -> MultistartResult:
     """SCP from REL and from up to ``n_starts - 1`` paths in distinct homotopy classes.
 
@@ -65,20 +68,23 @@ def solve_multistart(
         config: Settings of every SCP loop; ``reroutes`` plays no part, the starts are the routes.
         n_jobs: Processes over which the starts are spread; worth it where one problem has to be
             solved fast. For many problems use :func:`solve_many`.
-        first_only: Stop at the first start that is solved: SCP from REL, and other starts only
-            where that fails. One start after the other, whatever ``n_jobs``.
+        effort: ``"all"`` refines every start. ``"best"`` gives up those that fall behind
+            (:func:`race_scp`). ``"first"`` stops at the first one that is solved: SCP from REL, and
+            other starts only where that fails. The last two take one process, whatever ``n_jobs``.
 
     Returns:
         All results; deterministic, no random numbers are used.
     """
     if n_starts < 1:
         raise ValueError(f"n_starts must be at least 1, got {n_starts}.")
+    if effort not in EFFORTS:
+        raise ValueError(f"effort must be one of {EFFORTS}, got {effort!r}.")
     rel = solve_rel(problem, config)
     if rel.status.hopeless or problem.defects():
         return MultistartResult(rel, (solve_scp(problem, straight_line(problem), config),), ())
     config = replace(config or SCPConfig(), reroutes=0)
     starts = [rel.trajectory or straight_line(problem)]
-    if first_only:
+    if effort == "first":
         tried = [solve_scp(problem, starts[0], config)]
         if not tried[0].solved and n_starts > 1:
             for start in homotopy_starts(problem, n_starts - 1):
@@ -88,7 +94,9 @@ def solve_multistart(
         return MultistartResult(rel, tuple(tried), distinct_optima(tuple(tried)))
     if n_starts > 1:
         starts += homotopy_starts(problem, n_starts - 1)
-    if n_jobs == 1 or len(starts) == 1:
+    if effort == "best":
+        results = race_scp(problem, starts, config)
+    elif n_jobs == 1 or len(starts) == 1:
         results = tuple(solve_scp(problem, start, config) for start in starts)
     else:
         import joblib

@@ -288,7 +288,8 @@ def test_only_the_best_optimum_is_kept_on_request(recipe: Recipe):
     best, every = (solve_problems(one, 0, 3) for one in (Recipe.from_dict(fields), recipe))
     assert set(best.rank) == {0}
     kept = every.rank == 0
-    np.testing.assert_array_equal(best.cost, every.cost[kept])
+    # A race solves the subproblems in another order, which shows in the solver's last digits.
+    np.testing.assert_allclose(best.cost, every.cost[kept], rtol=1e-8)
     np.testing.assert_array_equal(best.problem, every.problem[kept])
 
 

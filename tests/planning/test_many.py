@@ -59,6 +59,12 @@ def test_warm_starts_and_multistart(problems):
     assert [m.best.cost for m in many] == [
         solve_multistart(problem, 3).best.cost for problem in problems[:3]
     ]
+    raced = [solve_multistart(problem, 3, effort="best") for problem in problems[:3]]
+    for slow, quick in zip(many, raced):
+        assert quick.best.cost == pytest.approx(slow.best.cost, rel=0.02)
+        assert sum(r.iterations for r in quick.results) <= sum(r.iterations for r in slow.results)
+    with pytest.raises(ValueError, match="effort must be one of"):
+        solve_multistart(problems[0], 3, effort="most")
     spread = solve_multistart(problems[0], 3, n_jobs=2)
     assert spread.best.cost == many[0].best.cost
     assert solve_many([]) == []
