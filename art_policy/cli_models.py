@@ -102,6 +102,7 @@ def evaluate_models(options: argparse.Namespace) -> None:
     text = "\n\n".join(
         f"{name} ({group_size(group)} problems)\n\n{markdown_table(group)}"
         for name, group in groups.items()
+        if ", T_f = " not in name  # the cells are for the file
     )
     print_result(options, summary, text)
 

@@ -7,7 +7,8 @@ A page says where a table comes from in a comment, and this script fills in what
     ...
     <!-- end of table -->
 
-that is a report of ``freeflyer evaluate``, a group of its problems, and the methods to show.
+that is a report of ``freeflyer evaluate``, a group of its problems, and the methods to show. With
+``cells`` as the group, numbers of obstacles and final times are set against one another.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import json
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 from art_policy.evaluation import markdown_table
 
@@ -40,6 +42,8 @@ def filled(page: str) -> str:
 def _table(source: str) -> str:
     path, group, methods = (part.strip() for part in source.split("|"))
     groups = json.loads((ROOT / path).read_text(encoding="utf-8"))["groups"]
+    if group == "cells":
+        return _grid(groups, *(name.strip() for name in methods.split(";")))
     if group not in groups:
         raise ValueError(f"{path} has no group {group!r}, only {', '.join(groups)}.")
     rows = {}
@@ -49,6 +53,25 @@ def _table(source: str) -> str:
         row = groups[group][method]
         rows[method] = {key: math.nan if row[key] is None else row[key] for key in row}
     return f"\n{markdown_table(rows)}\n\n"
+
+
+def _grid(groups: dict[str, Any], base: str, method: str) -> str:
+    """Infeasible rates of two methods and the second one's improvement, a row for each number."""
+    cells = {}
+    for name, group in groups.items():
+        if match := re.fullmatch(r"(\d+) obstacles, T_f = (.*) s", name):
+            one, other = group[base], group[method]
+            text = f"{one['infeasible_rate']:.1%} → {other['infeasible_rate']:.1%}"
+            if other["suboptimality_improvement"] is not None:
+                text += f"; {other['suboptimality_improvement']:+.1%}"
+            cells[int(match[1]), float(match[2])] = text
+    counts, times = (sorted({cell[axis] for cell in cells}) for axis in range(2))
+    lines = ["| obstacles | " + " | ".join(f"{time:g} s" for time in times) + " |"]
+    lines.append("|---" * (1 + len(times)) + "|")
+    for count in counts:
+        row = (cells.get((count, time), "") for time in times)
+        lines.append(f"| {count} | " + " | ".join(row) + " |")
+    return "\n" + "\n".join(lines) + "\n\n"
 
 
 def main() -> None:

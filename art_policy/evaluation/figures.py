@@ -19,8 +19,9 @@ _COLORS = ("#7f8794", "#b7bdc8", "#1f6fb4", "#7fb3dd", "#ec7a1c", "#f5b27c", "#2
 def figures(report: Mapping[str, Any], folder: Path) -> list[Path]:
     """Writes all figures that a report has the data for.
 
-    These are ``by_c_rel.png`` (paper, Fig. 3), ``by_final_time.png`` (Fig. 4) where there are
-    several final times, and ``cost_against_time.png``, which settles what to use when.
+    These are ``by_c_rel.png`` (paper, Fig. 3), ``by_final_time.png`` (Fig. 4) and
+    ``by_obstacles.png`` where there are several, and ``cost_against_time.png``, which settles what
+    to use when.
 
     Args:
         report: As :func:`art_policy.evaluation.report` gives it, or read back from JSON.
@@ -42,6 +43,13 @@ def figures(report: Mapping[str, Any], folder: Path) -> list[Path]:
     ]
     written = [cost_against_time(groups["all"], folder / "cost_against_time.png")]
     written.append(_by_group(by_c_rel, "$C_{REL}$ at least", folder / "by_c_rel.png"))
+    by_count = [
+        (float(name.split()[0]), group)
+        for name, group in groups.items()
+        if name.endswith(" obstacles")
+    ]
+    if len(by_count) > 1:
+        written.append(_by_group(by_count, "number of obstacles", folder / "by_obstacles.png"))
     if len(by_time) > 1:
         written.append(_by_group(by_time, "final time in s", folder / "by_final_time.png"))
     return written

@@ -139,6 +139,10 @@ def report(
         groups[f"{count} obstacles"] = [r for r in records if r.n_obstacles == count]
     for final_time in sorted({r.final_time for r in records}):
         groups[f"T_f = {final_time:g} s"] = [r for r in records if r.final_time == final_time]
+    cells = sorted({(r.n_obstacles, r.final_time) for r in records})
+    for cell in cells:
+        name = f"{cell[0]} obstacles, T_f = {cell[1]:g} s"
+        groups[name] = [r for r in records if (r.n_obstacles, r.final_time) == cell]
     return {
         "model": model if isinstance(model, str) else list(model),
         "settings": settings,
