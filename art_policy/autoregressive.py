@@ -88,7 +88,7 @@ class Autoregressive(nn.Module):
             batch.constraints_to_go,
             batch.time_to_go,
         )
-        control = self.embed_controls(batch.controls, batch.time_to_go)
+        control = self.embed_controls(batch.problems, batch.controls, batch.time_to_go)
         tokens = torch.cat([described, control], dim=2)  # (B, L, tokens a step, width)
         x = self.transform(tokens.flatten(1, 2)).view(size, length, -1, self.config.width)
         return self.control_decoder(x[:, :, -2]), self.outcome_decoder(x[:, :, -1])
@@ -130,12 +130,14 @@ class Autoregressive(nn.Module):
         ]
         if self.config.tokens_per_step == 2:
             parts = [torch.stack(parts).sum(0)]
-        time = self.time_encoder(time_features(time_to_go, self.config))
+        time = self._embed_time(problems, time_to_go)
         return torch.stack([part + time for part in parts], dim=2)
 
-    def embed_controls(self, controls: Tensor, time_to_go: Tensor) -> Tensor:
+    def embed_controls(
+        self, problems: ProblemBatch, controls: Tensor, time_to_go: Tensor
+    ) -> Tensor:
         """Tokens of the controls ``(B, L, 3)``: ``(B, L, 1, width)``."""
-        time = self.time_encoder(time_features(time_to_go, self.config))
+        time = self._embed_time(problems, time_to_go)
         return (self.control_encoder(controls / self.control_scale) + time)[:, :, None]
 
     def loss(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
@@ -166,14 +168,23 @@ class Autoregressive(nn.Module):
         position = 2.0 * states[..., :2] / size - 1.0
         return torch.cat([position, turn, *quarters, states[..., 3:] / self.rate_scale], dim=-1)
 
+    def _embed_time(self, problems: ProblemBatch, time_to_go: Tensor) -> Tensor:
+        """``(B, L, width)``, which tells the steps apart."""
+        if "time_to_go" not in self.config.descriptors:
+            time_to_go = problems.final_time[:, None] - time_to_go
+        return self.time_encoder(time_features(time_to_go))
+
     def _performance_features(
         self, problems: ProblemBatch, states: Tensor, budget: Tensor, time_to_go: Tensor
     ) -> Tensor:
-        """``(B, L, 13)``: the goal, on the table and relative to the state, and what is to go."""
+        """``(B, L, 13)``: the goal, on the table and relative to the state, and what is to go.
+
+        Descriptors that the configuration leaves out are zero.
+        """
         size = states.new_tensor(self.config.table)
         goal = problems.goal[:, None].expand_as(states)
         away = goal - states
-        return torch.cat(
+        target = torch.cat(
             [
                 2.0 * goal[..., :2] / size - 1.0,
                 (4.0 * goal[..., 2:3]).cos(),
@@ -181,9 +192,18 @@ class Autoregressive(nn.Module):
                 away[..., :2],
                 away[..., 2:3] / math.pi,
                 away[..., 3:] / self.rate_scale,
-                budget,
-                time_to_go[..., None] / _TIME_SCALE,
             ],
+            dim=-1,
+        )
+        parts = {
+            "goal": target,
+            "reward_to_go": budget[..., :1],
+            "constraint_to_go": budget[..., 1:],
+            "time_to_go": time_to_go[..., None] / _TIME_SCALE,
+        }
+        given = self.config.descriptors
+        return torch.cat(
+            [part if name in given else torch.zeros_like(part) for name, part in parts.items()],
             dim=-1,
         )
 
@@ -198,7 +218,7 @@ class Autoregressive(nn.Module):
         return (self.disc_encoder(features) * problems.present[:, None, :, None]).sum(2)
 
 
-def time_features(time_to_go: Tensor, config: ARTConfig) -> Tensor:
+def time_features(time_to_go: Tensor) -> Tensor:
     """``(..., 33)``: the time-to-go, and its sines and cosines at periods from 1 s to 400 s."""
     octaves = torch.linspace(0.0, 1.0, (_N_TIME - 1) // 2, device=time_to_go.device)
     phase = 2.0 * math.pi * time_to_go[..., None] / (400.0**octaves)

@@ -15,6 +15,8 @@ from art_policy.envelope import Envelope
 
 HEADS = ("multi_hypothesis", "autoregressive")
 SCENE_DESCRIPTORS = ("relative", "absolute")
+DESCRIPTORS = ("goal", "reward_to_go", "constraint_to_go", "time_to_go")
+CONSTRAINT_TO_GO = ("decremented", "constant")
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,11 @@ class ARTConfig:
             control), or 2 (the three descriptors summed into one token, control).
         scene_descriptors: Autoregressive only: ``"relative"`` or ``"absolute"`` obstacles
             (paper, Sec. IV-C, question 3).
+        descriptors: Autoregressive only: the performance descriptors that are read (paper, Sec.
+            III-A), any of ``"goal"``, ``"reward_to_go"``, ``"constraint_to_go"``, ``"time_to_go"``.
+            Without the last, steps are told apart by the time since the start.
+        constraint_to_go: Autoregressive only: ``"decremented"`` at each violation, as in the paper
+            (eq. 6), or ``"constant"``, as in its authors' code.
         predict_time_to_go: Autoregressive only: adds the time-to-go to the loss (the paper's FT
             loss).
         envelope: Ranges of what the model was trained on; training fills it in.
@@ -52,6 +59,8 @@ class ARTConfig:
     context_length: int = 100
     tokens_per_step: int = 4
     scene_descriptors: str = "relative"
+    descriptors: tuple[str, ...] = DESCRIPTORS
+    constraint_to_go: str = "decremented"
     predict_time_to_go: bool = False
     envelope: Envelope | None = None
 
@@ -60,6 +69,13 @@ class ARTConfig:
         self._require_choice("head", HEADS)
         self._require_choice("scene_descriptors", SCENE_DESCRIPTORS)
         self._require_choice("tokens_per_step", (2, 4))
+        self._require_choice("constraint_to_go", CONSTRAINT_TO_GO)
+        object.__setattr__(self, "descriptors", tuple(self.descriptors))
+        if unknown := set(self.descriptors) - set(DESCRIPTORS):
+            raise ValueError(
+                f"ARTConfig.descriptors must be of {', '.join(map(repr, DESCRIPTORS))}, "
+                f"got {sorted(unknown)}."
+            )
         for name in ("width", "n_layers", "n_heads", "n_hypotheses", "n_knots", "context_length"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"ARTConfig.{name} must be at least 1, got {getattr(self, name)}.")
@@ -94,7 +110,8 @@ class ARTConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; :meth:`from_dict` is its inverse."""
-        return {**dataclasses.asdict(self), "table": list(self.table)}
+        lists = {"table": list(self.table), "descriptors": list(self.descriptors)}
+        return {**dataclasses.asdict(self), **lists}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> ARTConfig:

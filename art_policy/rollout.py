@@ -186,7 +186,7 @@ def generate(
         x = net.transform(tokens, cache)[:, -1]
         control = (net.control_decoder(x) * net.control_scale).double().cpu().numpy()
         control = _within_limits(problems[0].scenario, state, control)
-        last = net.embed_controls(_column(control, device), _column(time_to_go, device))
+        last = net.embed_controls(batch, _column(control, device), _column(time_to_go, device))
         last = last.flatten(1, 2)
         tokens = last if use_cache else torch.cat([tokens, last], dim=1)
         returns = np.minimum(returns + np.abs(control).sum(axis=1), 0.0)

@@ -325,10 +325,9 @@ def _examples(
     splits = [dataset.split(config.validation_fraction) for dataset in datasets]
     pairs = list(zip(datasets, splits))
     if model.head == "autoregressive":
+        settings = (model.table, model.context_length, model.constraint_to_go == "constant")
         training, validation = (
-            SequenceSet.joined(
-                [SequenceSet(d, s[side], model.table, model.context_length) for d, s in pairs]
-            )
+            SequenceSet.joined([SequenceSet(d, s[side], *settings) for d, s in pairs])
             for side in range(2)
         )
         return training, validation

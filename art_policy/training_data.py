@@ -183,6 +183,7 @@ class SequenceSet:
         trajectories: Indices of the trajectories to use.
         table: Size of the table in m, for augmentation.
         length: Number of steps of a window, the model's context length.
+        constant_budget: Whether the constraint-to-go stays what it is for the whole trajectory.
     """
 
     def __init__(
@@ -191,6 +192,7 @@ class SequenceSet:
         trajectories: np.ndarray,
         table: tuple[float, float],
         length: int,
+        constant_budget: bool = False,
     ) -> None:
         problems, slot = np.unique(dataset.problem_index[trajectories], return_inverse=True)
         self._problems = problem_batch(dataset, problems)
@@ -199,7 +201,7 @@ class SequenceSet:
         self._n_steps = torch.from_numpy(np.diff(dataset.offsets)[trajectories])
         self._controls = dataset.controls
         self._dt, self._robot = dataset.dt, dataset.robot
-        self._table, self._length = table, length
+        self._table, self._length, self._constant_budget = table, length, constant_budget
 
     @classmethod
     def joined(cls, sets: Sequence[SequenceSet]) -> SequenceSet:
@@ -240,6 +242,9 @@ class SequenceSet:
             flipped = reverse_controls(controls, n_steps)
             controls = torch.where(reverse[:, None, None], flipped, controls)
         whole = SequenceBatch.from_controls(problems, controls, n_steps, self._dt, self._robot)
+        if self._constant_budget:
+            budget = whole.constraints_to_go[:, :1].expand_as(whole.constraints_to_go)
+            whole = replace(whole, constraints_to_go=budget)
         last = (n_steps - self._length).clamp(min=0)
         share = (
             torch.rand(len(index), generator=generator) if generator else torch.zeros(len(index))

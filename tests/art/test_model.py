@@ -79,6 +79,34 @@ def test_every_descriptor_matters(dataset: PackedDataset, name: str) -> None:
     assert (model(batch)[0][:, 4] != model(replace(batch, **{name: value}))[0][:, 4]).any(1).all()
 
 
+@pytest.mark.parametrize(
+    ("left_out", "name"),
+    [("reward_to_go", "returns_to_go"), ("constraint_to_go", "constraints_to_go")],
+)
+def test_descriptors_that_are_left_out_do_not_matter(
+    dataset: PackedDataset, left_out: str, name: str
+) -> None:
+    given = tuple(each for each in TINY_SEQUENCE.descriptors if each != left_out)
+    model, batch = make(replace(TINY_SEQUENCE, descriptors=given)), sequences(dataset, TINY)
+    other = replace(batch, **{name: getattr(batch, name) + 0.3})
+    assert torch.equal(model(batch)[0], model(other)[0])
+
+
+def test_without_goal_and_time_to_go(dataset: PackedDataset) -> None:
+    model = make(replace(TINY_SEQUENCE, descriptors=("reward_to_go",)))
+    batch = sequences(dataset, TINY)
+    later = replace(
+        batch,
+        time_to_go=batch.time_to_go + 5.0,
+        problems=replace(
+            batch.problems,
+            goal=batch.problems.goal + 0.1,
+            final_time=batch.problems.final_time + 5.0,
+        ),
+    )
+    torch.testing.assert_close(model(batch)[0], model(later)[0], atol=1e-5, rtol=1e-5)
+
+
 def test_cached_and_uncached_agree_beyond_the_context(dataset: PackedDataset) -> None:
     net = make(replace(TINY_SEQUENCE, context_length=5)).net
     tokens = torch.randn(3, 61, TINY.width)
@@ -173,6 +201,7 @@ def test_paper_size() -> None:
         ({"n_layers": 0}, "n_layers must be at least 1, got 0"),
         ({"dropout": 1.0}, r"dropout must be in \[0, 1\), got 1.0"),
         ({"tokens_per_step": 3}, "tokens_per_step must be one of 2, 4, got 3"),
+        ({"descriptors": ["gaol"]}, r"descriptors must be of 'goal', .*, got \['gaol'\]"),
         ({"table": (3.5, -1.0)}, "table must be two positive sides"),
     ],
 )

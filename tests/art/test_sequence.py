@@ -184,6 +184,18 @@ def test_joined_sets_hold_the_examples_of_each(dataset: PackedDataset) -> None:
     torch.testing.assert_close(joined.controls, alone.controls)
 
 
+def test_the_constraint_to_go_may_stay_what_it_was(dataset: PackedDataset) -> None:
+    every, table = np.arange(len(dataset)), (LENGTH, WIDTH)
+    index = torch.arange(len(dataset))
+    falling, constant = (
+        SequenceSet(dataset, every, table, 200, constant_budget=flag).batch(index, None)
+        for flag in (False, True)
+    )
+    assert (falling.constraints_to_go.diff(dim=1) < 0).any()
+    first = falling.constraints_to_go[:, :1]
+    assert (constant.constraints_to_go == first).all()
+
+
 def test_hypothesis_set_holds_the_optima_cheapest_first(dataset: PackedDataset) -> None:
     training = HypothesisSet(dataset, np.arange(len(dataset)), (LENGTH, WIDTH))
     costs = training.batch(torch.arange(len(training)), None).costs
