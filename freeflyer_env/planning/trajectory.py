@@ -72,6 +72,25 @@ class Trajectory:
         poses = [np.interp(at, share, self.states[:-1, axis]) for axis in range(3)]
         return Trajectory.from_poses(problem, np.column_stack(poses))
 
+    def landed(self, problem: Problem, last: int | None = None) -> Trajectory:
+        """The trajectory with the least change of its controls that makes it end at the goal.
+
+        It is the projection onto the dynamics and the goal, without the actuation limits: 2-norm of
+        the change, each axis for itself.
+
+        Args:
+            problem: Gives the goal.
+            last: How many of the last controls may change, at least 2; all if None.
+        """
+        steps = np.arange(self.n_steps)[-(last or self.n_steps) :]
+        miss = (problem.goal - self.states[-1]).reshape(2, 3)  # pose, rates
+        # The pose and the rate at the end per unit of each control.
+        effect = np.array([self.dt * (self.n_steps - 1 - steps), np.ones(len(steps))])
+        change = effect.T @ np.linalg.solve(effect @ effect.T, miss)
+        controls = self.controls.copy()
+        controls[steps] += change / problem.scenario.robot.control_gain
+        return type(self).from_controls(problem, controls)
+
     @property
     def n_steps(self) -> int:
         return len(self.controls)

@@ -253,3 +253,21 @@ def test_a_time_limit_is_kept():
 def test_bad_settings(settings, message):
     with pytest.raises(ValueError, match=message):
         SCPConfig(**settings)
+
+
+@pytest.mark.parametrize("last", [None, 10, 2])
+def test_landing_is_the_least_change_that_reaches_the_goal(last):
+    rng = np.random.default_rng(4)
+    problem = sample_problem(rng)
+    wild = Trajectory.from_controls(problem, 1e-3 * rng.normal(size=(problem.n_steps, 3)))
+    landed = wild.landed(problem, last)
+    np.testing.assert_allclose(landed.states[-1], problem.goal, atol=1e-12)
+    change = landed.controls - wild.controls
+    assert (change[: problem.n_steps - (last or problem.n_steps)] == 0.0).all()
+    # Least in the 2-norm: a change that keeps the end is orthogonal to it.
+    steps = np.arange(problem.n_steps)[-(last or problem.n_steps) :]
+    effect = np.array([np.ones(len(steps)), problem.n_steps - 1 - steps], dtype=float)
+    detour = rng.normal(size=len(steps))
+    detour -= effect.T @ np.linalg.solve(effect @ effect.T, effect @ detour)
+    np.testing.assert_allclose(detour @ change[steps], 0.0, atol=1e-9)
+    np.testing.assert_allclose(landed.landed(problem).controls, landed.controls, atol=1e-9)
