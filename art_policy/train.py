@@ -12,6 +12,7 @@ import dataclasses
 import logging
 import math
 import os
+import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,111 +20,40 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from tqdm.auto import tqdm
 
 from art_policy.autoregressive import Autoregressive
+from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
-from art_policy.train_io import Interrupt, JsonLines
+from art_policy.model_card import write_card
+from art_policy.throughput import flops_per_example
+from art_policy.train_config import TrainConfig
+from art_policy.train_io import Interrupt, Log
 from art_policy.training_data import HypothesisSet, SequenceSet
 
 if TYPE_CHECKING:
+    from accelerate import Accelerator
+
     from freeflyer_datasets.loading import PackedDataset
 
 ExampleSet = HypothesisSet | SequenceSet
 
 logger = logging.getLogger(__name__)
 
-CHECKPOINT_NAME, LOG_NAME = "checkpoint.pt", "log.jsonl"
-PRECISIONS = ("auto", "float32", "bfloat16")
+CHECKPOINT_NAME, BEST_NAME = "checkpoint.pt", "best"
 
 
-@dataclass(frozen=True)
-class TrainConfig:
-    """How to train.
+class _Objective(nn.Module):
+    """A model's loss as a module, which can be spread over processes."""
 
-    Attributes:
-        max_steps: Number of optimiser steps, or None if only the clock counts.
-        max_minutes: Minutes of training, over all resumed runs, or None. Whichever comes first
-            ends the run, and the learning rate reaches its end there.
-        batch_size: Examples in a step (at most as many as there are).
-        learning_rate: Peak rate of AdamW; linear warm-up, then cosine decay to a hundredth.
-        weight_decay: Of matrices; vectors are not decayed.
-        warmup_share: Share of the run that warms up.
-        gradient_clip: Largest norm of the gradient.
-        ema_decay: Decay of the running average of the weights, which is what is saved.
-        augment: Whether examples are put under random symmetries of the problem.
-        tails: Multi-hypothesis only: share of the problems of which one is added that begins in
-            flight, for re-planning.
-        max_discs: Multi-hypothesis only: if given, augmentation adds up to so many discs to a scene
-            where they leave the best optimum what it is.
-        init: Model whose weights training begins with, as :meth:`ART.from_pretrained` takes it;
-            None for random ones.
-        validation_fraction: Share of the problems that are held out.
-        log_every: Steps between lines of the log.
-        validate_every: Steps between validations.
-        checkpoint_minutes: Minutes between checkpoints.
-        precision: ``"bfloat16"`` for autocast, ``"float32"``, or ``"auto"``: bfloat16 where the
-            processor has instructions for it.
-        threads: Threads of PyTorch, or None to leave that alone.
-        seed: Of everything random.
-        device: Where to train.
-        compile: Whether to use ``torch.compile``.
-    """
+    def __init__(self, model: ART) -> None:
+        super().__init__()
+        self.model = model
 
-    max_steps: int | None = None
-    max_minutes: float | None = None
-    batch_size: int = 512
-    learning_rate: float = 1e-3
-    weight_decay: float = 0.05
-    warmup_share: float = 0.03
-    gradient_clip: float = 1.0
-    ema_decay: float = 0.999
-    augment: bool = True
-    tails: float = 0.25
-    max_discs: int | None = None
-    init: str | None = None
-    validation_fraction: float = 0.05
-    log_every: int = 50
-    validate_every: int = 500
-    checkpoint_minutes: float = 3.0
-    precision: str = "auto"
-    threads: int | None = None
-    seed: int = 0
-    device: str = "cpu"
-    compile: bool = False
-
-    def __post_init__(self) -> None:
-        if self.max_steps is None and self.max_minutes is None:
-            raise ValueError("TrainConfig needs max_steps or max_minutes (or both).")
-        for name in ("max_steps", "max_minutes", "batch_size", "learning_rate", "gradient_clip",
-                     "log_every", "validate_every", "checkpoint_minutes"):  # fmt: skip
-            value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise ValueError(f"TrainConfig.{name} must be positive, got {value}.")
-        for name in ("warmup_share", "ema_decay"):
-            if not 0.0 <= getattr(self, name) < 1.0:
-                raise ValueError(
-                    f"TrainConfig.{name} must be in [0, 1), got {getattr(self, name)}."
-                )
-        if self.precision not in PRECISIONS:
-            raise ValueError(
-                f"TrainConfig.precision must be one of {PRECISIONS}, got {self.precision!r}."
-            )
-
-    def progress(self, step: int, seconds: float) -> float:
-        """Share of the run that is done, 0 to 1, by steps or by the clock."""
-        by_steps = step / self.max_steps if self.max_steps else 0.0
-        by_clock = seconds / (60.0 * self.max_minutes) if self.max_minutes else 0.0
-        return min(max(by_steps, by_clock), 1.0)
-
-    def rate(self, progress: float) -> float:
-        """Learning rate at a share of the run."""
-        if progress < self.warmup_share:
-            return self.learning_rate * max(progress / self.warmup_share, 0.01)
-        share = (progress - self.warmup_share) / (1.0 - self.warmup_share)
-        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1.0 + math.cos(math.pi * share)))
+    def forward(self, batch: Any) -> tuple[Tensor, dict[str, Tensor]]:
+        return self.model.net.loss(batch)
 
 
 @dataclass
@@ -131,17 +61,25 @@ class _State:
     """A run: what a checkpoint holds, and one step of it."""
 
     model: ART
-    compute_loss: Callable[..., tuple[Tensor, dict[str, Tensor]]]
+    objective: Callable[..., tuple[Tensor, dict[str, Tensor]]]
     average: list[Tensor]
     optimizer: torch.optim.Optimizer
+    accelerator: Accelerator
     settings: dict[str, Any]
     step: int = 0
     seconds: float = 0.0
+    best: float = math.inf
 
     @classmethod
-    def create(cls, model_config: ARTConfig, config: TrainConfig, data: dict[str, Any]) -> _State:
+    def create(
+        cls,
+        model_config: ARTConfig,
+        config: TrainConfig,
+        data: dict[str, Any],
+        accelerator: Accelerator,
+    ) -> _State:
         torch.manual_seed(config.seed)
-        model = ART(model_config).to(config.device)
+        model = ART(model_config).to(accelerator.device)
         if config.init is not None:
             _initialise(model, config.init)
         matrices = [p for p in model.parameters() if p.dim() >= 2]
@@ -158,8 +96,11 @@ class _State:
             "train": dataclasses.asdict(config),
             "data": data,
         }
-        compute_loss = torch.compile(model.net.loss) if config.compile else model.net.loss
-        return cls(model, compute_loss, average, optimizer, settings)
+        objective: Any = _Objective(model)
+        if config.compile:
+            objective = torch.compile(objective)
+        objective, optimizer = accelerator.prepare(objective, optimizer)
+        return cls(model, objective, average, optimizer, accelerator, settings)
 
     def save(self, path: Path) -> None:
         """Writes the checkpoint; a crash leaves the old one or the new one, never half of one."""
@@ -169,6 +110,7 @@ class _State:
             "optimizer": self.optimizer.state_dict(),
             "step": self.step,
             "seconds": self.seconds,
+            "best": self.best,
             "settings": self.settings,
         }
         temporary = path.with_suffix(".tmp")
@@ -190,6 +132,7 @@ class _State:
         for mine, stored in zip(self.average, content["average"]):
             mine.copy_(stored)
         self.step, self.seconds = content["step"], content["seconds"]
+        self.best = content.get("best", math.inf)
 
     def advance(self, batch: Any, config: TrainConfig) -> dict[str, float | Tensor]:
         """One optimiser step; returns figures to log."""
@@ -197,11 +140,12 @@ class _State:
         rate = config.rate(config.progress(self.step, self.seconds))
         for group in self.optimizer.param_groups:
             group["lr"] = rate
-        torch.manual_seed(_seed(config.seed, self.step))  # of dropout
+        rank = self.accelerator.process_index
+        torch.manual_seed(_seed(config.seed, self.step) + (rank << 56))  # of dropout
         self.model.train()
-        with _autocast(config):
-            loss, figures = self.compute_loss(batch)
-        loss.backward()
+        with _autocast(config, self.accelerator.device):
+            loss, figures = self.objective(batch)
+        self.accelerator.backward(loss)
         norm = torch.nn.utils.clip_grad_norm_(
             self.model.parameters(), config.gradient_clip, error_if_nonfinite=True
         )
@@ -209,7 +153,7 @@ class _State:
         self.optimizer.zero_grad(set_to_none=True)
         self.step += 1
         self.update_average(config.ema_decay)
-        speed = len(batch) / (time.perf_counter() - began)
+        speed = len(batch) * self.accelerator.num_processes / (time.perf_counter() - began)
         return {"lr": rate, "loss": loss, "norm": norm, "samples_per_s": speed, **figures}
 
     def update_average(self, decay: float) -> None:
@@ -228,8 +172,8 @@ class _State:
 
 #: Settings in which a resumed run may differ from the one that wrote the checkpoint.
 _MAY_CHANGE = frozenset(
-    {"threads", "log_every", "validate_every", "checkpoint_minutes", "compile", "device",
-     "max_minutes", "max_steps"}
+    {"threads", "log_every", "validate_every", "solve_problems", "checkpoint_minutes",
+     "compile", "device", "max_minutes", "max_steps"}
 )  # fmt: skip
 
 
@@ -240,23 +184,33 @@ def train(
     out: str | Path,
     resume: bool = True,
 ) -> ART:
-    """Trains a model and writes it, its log and its checkpoint into ``out``.
+    """Trains a model and writes it, its log, its checkpoint and its card into ``out``.
+
+    It runs on one processor or GPU, and on several or on several machines where it is started by
+    ``accelerate launch``; there ``batch_size`` is the number of examples of all together, and
+    ``max_steps`` has to be given.
 
     Args:
         data: Packed dataset, or several; a share of the problems of each is held out for
             validation.
         model_config: Size and kind of the model.
         config: How to train.
-        out: Folder for ``model.safetensors``, ``config.json``, ``log.jsonl``, ``checkpoint.pt``.
-        resume: Whether to go on from a checkpoint in ``out``.
+        out: Folder for ``model.safetensors``, ``config.json``, ``README.md``, ``log.jsonl``,
+            ``tensorboard``, ``checkpoint.pt``, and ``best``, the model that planned best so far.
 
     Returns:
-        The model with averaged weights, in evaluation mode. After Ctrl-C too: everything is saved.
+        The model with averaged weights that planned best, in evaluation mode. After Ctrl-C too:
+        everything is saved.
 
     Raises:
         ValueError: If a checkpoint in ``out`` is of a different run, or there is nothing to train
             on.
     """
+    from accelerate import Accelerator
+
+    accelerator = Accelerator(cpu=config.device == "cpu")
+    if accelerator.num_processes > 1 and config.max_minutes is not None:
+        raise ValueError("Several processes must agree on the length: give max_steps alone.")
     out = Path(out)
     out.mkdir(parents=True, exist_ok=True)
     if config.threads:
@@ -266,23 +220,34 @@ def train(
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
     model_config = dataclasses.replace(model_config, envelope=training.envelope)
-    source = {"dataset": " + ".join(each.dataset_id for each in datasets)}
-    state = _State.create(model_config, config, {**source, "examples": len(training)})
+    names = " + ".join(each.dataset_id for each in datasets)
+    source = {"dataset": names, "examples": len(training)}
+    state = _State.create(model_config, config, source, accelerator)
     if isinstance(state.model.net, Autoregressive) and isinstance(training, SequenceSet):
         sample = training.batch(torch.arange(min(len(training), 2048)), torch.Generator())
-        state.model.net.fit_scales(sample)
+        state.model.net.fit_scales(sample.to(accelerator.device))
     checkpoint = out / CHECKPOINT_NAME
     if resume and checkpoint.exists():
         state.load(checkpoint)
         logger.info("Resuming at step %d of %s.", state.step, checkpoint)
-    log = JsonLines(out / LOG_NAME, state.step)
-    logger.info("%d problems, %d parameters.", len(training), state.model.num_parameters)
-    _loop(state, training, validation, config, log, checkpoint)
-    state.save(checkpoint)
+    elif accelerator.is_main_process:
+        shutil.rmtree(out / BEST_NAME, ignore_errors=True)
+    log = Log(out, state.step) if accelerator.is_main_process else None
+    examiner = Examiner(datasets, config)
+    if log:
+        logger.info("%d examples, %d parameters.", len(training), state.model.num_parameters)
+    finished = _loop(state, training, validation, examiner, config, log, out)
     model = state.averaged_model()
-    if len(validation):
-        log.write(step=state.step, **_validate(model, validation, config))
-    model.save_pretrained(out)
+    if log:
+        if finished:
+            _examine(state, model, validation, examiner, config, log, out)
+        state.save(checkpoint)
+        if (out / BEST_NAME).is_dir():
+            model = ART.from_pretrained(out / BEST_NAME, str(accelerator.device))
+        model.save_pretrained(out)
+        write_card(out, state.settings, log.rows(), flops_per_example(state.model, training))
+        log.close()
+    accelerator.wait_for_everyone()
     return model
 
 
@@ -290,32 +255,57 @@ def _loop(
     state: _State,
     training: ExampleSet,
     validation: ExampleSet,
+    examiner: Examiner,
     config: TrainConfig,
-    log: JsonLines,
-    checkpoint: Path,
-) -> None:
-    """Optimiser steps until the schedule ends, or until Ctrl-C."""
-    batches = _batches(training, state.step, config)
+    log: Log | None,
+    out: Path,
+) -> bool:
+    """Optimiser steps until the schedule ends, or until Ctrl-C; whether it came to the end."""
+    batches = _batches(training, state.step, config, state.accelerator)
     start = saved = time.perf_counter()
     before = state.seconds
     layout = "{percentage:3.0f}% |{bar}| {elapsed}<{remaining}"
-    bar = tqdm(total=100, desc="training", leave=False, bar_format=layout)
+    bar = tqdm(total=100, desc="training", leave=False, bar_format=layout, disable=log is None)
     with Interrupt() as interrupt, bar:
         while (progress := config.progress(state.step, state.seconds)) < 1.0 and not interrupt.seen:
             figures = state.advance(next(batches), config)
             now = time.perf_counter()
             state.seconds = before + now - start
             bar.update(100.0 * progress - bar.n)
+            if log is None:
+                continue
             if state.step % config.log_every == 0:
                 log.write(step=state.step, minutes=state.seconds / 60.0, **figures)
-            if state.step % config.validate_every == 0 and len(validation):
-                log.write(step=state.step, **_validate(state.averaged_model(), validation, config))
+            if state.step % config.validate_every == 0:
+                _examine(state, state.averaged_model(), validation, examiner, config, log, out)
             if now - saved > 60.0 * config.checkpoint_minutes:
-                state.save(checkpoint)
-                state.averaged_model().save_pretrained(checkpoint.parent)
+                state.save(out / CHECKPOINT_NAME)
+                state.averaged_model().save_pretrained(out)
                 saved = now
     if interrupt.seen:
         logger.warning("Interrupted at step %d; saving.", state.step)
+    return not interrupt.seen
+
+
+def _examine(
+    state: _State,
+    model: ART,
+    validation: ExampleSet,
+    examiner: Examiner,
+    config: TrainConfig,
+    log: Log,
+    out: Path,
+) -> None:
+    """Validates a model, lets it plan, and keeps it if none planned better."""
+    figures = _validate(model, validation, config) if len(validation) else {}
+    if config.solve_problems:
+        planned = examiner.examine(model)
+        figures |= planned
+        if planned["val_excess"] <= state.best:
+            state.best = planned["val_excess"]
+            model.save_pretrained(out / BEST_NAME)
+    if figures:
+        log.write(step=state.step, **figures)
 
 
 def _examples(
@@ -358,8 +348,14 @@ def _batch_size(training: ExampleSet, config: TrainConfig) -> int:
     return min(config.batch_size, len(training))
 
 
-def _batches(training: ExampleSet, step: int, config: TrainConfig) -> Iterator[Any]:
-    """Endless batches from ``step`` on; every epoch in its own order, its last part dropped."""
+def _batches(
+    training: ExampleSet, step: int, config: TrainConfig, accelerator: Accelerator
+) -> Iterator[Any]:
+    """Endless batches from ``step`` on; every epoch in its own order, its last part dropped.
+
+    Each process takes its share of a batch.
+    """
+    rank, count = accelerator.process_index, accelerator.num_processes
     size = _batch_size(training, config)
     per_epoch = len(training) // size
     generator, epoch, order = torch.Generator(), -1, torch.empty(0)
@@ -369,10 +365,10 @@ def _batches(training: ExampleSet, step: int, config: TrainConfig) -> Iterator[A
             generator.manual_seed(_seed(config.seed, -1 - epoch))
             order = torch.randperm(len(training), generator=generator)
         first = step % per_epoch * size
-        generator.manual_seed(_seed(config.seed, step))
-        index = order[first : first + size]
+        generator.manual_seed(_seed(config.seed, step) + (rank << 56))
+        index = order[first : first + size][rank::count]
         batch = training.batch(index, generator if config.augment else None)
-        yield batch.to(config.device) if config.device != "cpu" else batch
+        yield batch.to(accelerator.device)
         step += 1
 
 
@@ -387,16 +383,16 @@ def _validate(model: ART, validation: ExampleSet, config: TrainConfig) -> dict[s
     count = min(len(validation), 4096)
     sums: dict[str, float] = {}
     for index in torch.linspace(0, len(validation) - 1, count).long().split(512):
-        batch: Any = validation.batch(index, None).to(config.device)
-        with _autocast(config):
+        batch: Any = validation.batch(index, None).to(model.device)
+        with _autocast(config, model.device):
             loss, figures = model.net.loss(batch)
         for name, value in {"loss": loss, **figures}.items():
             sums[name] = sums.get(name, 0.0) + float(value) * len(index)
     return {f"val_{name}": value / count for name, value in sums.items()}
 
 
-def _autocast(config: TrainConfig) -> torch.autocast:
-    kind = torch.device(config.device).type
+def _autocast(config: TrainConfig, device: torch.device) -> torch.autocast:
+    kind = device.type
     enabled = config.precision == "bfloat16"
     if config.precision == "auto":
         enabled = kind == "cuda" or torch.cpu._is_avx512_bf16_supported()

@@ -13,6 +13,8 @@ from torch import Tensor
 
 logger = logging.getLogger(__name__)
 
+LOG_NAME = "log.jsonl"
+
 
 class Interrupt:
     """Turns Ctrl-C into a flag, so that no step is cut in half; a second one stops at once."""
@@ -35,20 +37,48 @@ class Interrupt:
         signal.signal(signal.SIGINT, self._previous)
 
 
-class JsonLines:
-    """JSON lines; of a resumed run, lines past the checkpoint are dropped first."""
+class Log:
+    """Figures of a run: ``log.jsonl``, and ``tensorboard`` where TensorBoard is installed.
 
-    def __init__(self, path: Path, step: int) -> None:
-        self._path = path
-        lines = path.read_text("utf-8").splitlines() if step and path.exists() else []
+    Of a resumed run, what was written after the checkpoint is dropped first.
+
+    Args:
+        folder: The model's.
+        step: Step at which the run goes on; 0 begins a new log.
+    """
+
+    def __init__(self, folder: Path, step: int) -> None:
+        self._path = folder / LOG_NAME
+        lines = self._path.read_text("utf-8").splitlines() if self._path.exists() else []
         kept = [line for line in lines if _is_whole(line) and json.loads(line)["step"] <= step]
-        path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+        kept = kept if step else []
+        self._path.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+        self._board: Any = None
+        try:
+            from torch.utils.tensorboard import SummaryWriter
+        except ImportError:
+            return
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
-    def write(self, **figures: Any) -> None:
-        row = {name: _plain(value) for name, value in figures.items()}
+    def write(self, step: int, **figures: Any) -> None:
+        """Adds figures of a step."""
+        row = {name: _plain(value) for name, value in {"step": step, **figures}.items()}
         with self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps(row) + "\n")
         logger.info(" ".join(f"{name}={value:.4g}" for name, value in row.items()))
+        if self._board:
+            for name, value in row.items():
+                kind = "validation" if name.startswith("val_") else "training"
+                self._board.add_scalar(f"{kind}/{name.removeprefix('val_')}", value, step)
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Everything that was written, in order."""
+        return [json.loads(line) for line in self._path.read_text("utf-8").splitlines()]
+
+    def close(self) -> None:
+        """Writes what TensorBoard still holds."""
+        if self._board:
+            self._board.close()
 
 
 def _is_whole(line: str) -> bool:

@@ -35,7 +35,9 @@ from art_policy.multi_hypothesis import (
     problem_features,
 )
 from art_policy.sequence import ProblemBatch
-from art_policy.train import LOG_NAME, TrainConfig, train
+from art_policy.train import train
+from art_policy.train_config import TrainConfig
+from art_policy.train_io import LOG_NAME
 from freeflyer_datasets import PackedDataset
 
 #: Name, problems, changes of the model, changes of the loss, changes of the training.

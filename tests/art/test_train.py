@@ -4,18 +4,24 @@ from __future__ import annotations
 
 import json
 import signal
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 from art_policy import train as train_module
+from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.sequence import DISC_SPEED
-from art_policy.train import CHECKPOINT_NAME, LOG_NAME, TrainConfig, train
+from art_policy.train import CHECKPOINT_NAME, train
+from art_policy.train_config import TrainConfig
+from art_policy.train_io import LOG_NAME
 from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
@@ -164,3 +170,60 @@ def test_training_begins_with_the_weights_of_another_model(
         torch.testing.assert_close(a, b, atol=1e-6, rtol=1e-6)
     with pytest.raises(ValueError, match="is of another width than the model"):
         train(dataset, replace(TINY, width=2 * TINY.width), config, tmp_path / "third")
+
+
+def test_training_keeps_the_model_that_plans_best(
+    dataset: PackedDataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scores = iter([0.3, 0.1, 0.2])
+    monkeypatch.setattr(
+        train_module.Examiner, "examine", lambda examiner, model: {"val_excess": next(scores)}
+    )
+    train(dataset, TINY, replace(SHORT, validate_every=2, max_steps=5), tmp_path)
+    log = log_of(tmp_path)
+    assert [row["val_excess"] for row in log if "val_excess" in row] == [0.3, 0.1, 0.2]
+    best, kept = (tmp_path / name / "model.safetensors" for name in ("best", "."))
+    assert best.read_bytes() == kept.read_bytes()
+    last = torch.load(tmp_path / CHECKPOINT_NAME, weights_only=True)["average"]
+    kept_model = ART.from_pretrained(tmp_path)
+    assert any((a != b).any() for a, b in zip(last, kept_model.parameters()))
+
+
+def test_examining_is_planning_without_rel(dataset: PackedDataset) -> None:
+    examiner = Examiner([dataset], replace(SHORT, solve_problems=5, validation_fraction=0.5))
+    torch.manual_seed(0)
+    figures = examiner.examine(ART(TINY).eval())
+    assert 0.0 <= figures["val_infeasible"] <= 1.0
+    assert -0.01 < figures["val_excess"] <= 0.5
+    assert Examiner([dataset], replace(SHORT, solve_problems=0)).examine(ART(TINY)) is not None
+
+
+def test_a_card_and_tensorboard_are_left_behind(dataset: PackedDataset, tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard")
+    train(dataset, TINY_SEQUENCE, SHORT, tmp_path)
+    card = (tmp_path / "README.md").read_text()
+    assert "autoregressive ART" in card
+    assert "TFLOP/s of matrix products" in card
+    assert "freeflyer/tiny-v0" in card
+    assert list((tmp_path / "tensorboard").glob("events.*"))
+
+
+def test_two_processes_train_as_one_does(dataset: PackedDataset, tmp_path: Path) -> None:
+    settings = {"threads": 1, "log_every": 1, "augment": False, "precision": "float32",
+                "batch_size": 8, "solve_problems": 4, "tails": 0.0}  # fmt: skip
+    command = ["-m", "art_policy.cli", "train", str(dataset.path), "--steps", "3",
+               "--model-config", json.dumps({"width": 32, "n_layers": 1, "n_heads": 2}),
+               "--train-config", json.dumps(settings)]  # fmt: skip
+    launch = ["-m", "accelerate.commands.launch", "--cpu", "--num_processes", "2", "--num_machines",
+              "1", "--mixed_precision", "no", "--dynamo_backend", "no"]  # fmt: skip
+    for name, start in (("one", command), ("two", [*launch, *command])):
+        done = subprocess.run(
+            [sys.executable, *start, "--out", str(tmp_path / name)],
+            capture_output=True, text=True, timeout=200, check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr[-2000:]
+    one, two = ([row for row in log_of(tmp_path / name) if "lr" in row] for name in ("one", "two"))
+    assert len(one) == len(two) == 3
+    weights = [load_file(tmp_path / name / "model.safetensors") for name in ("one", "two")]
+    for name, value in weights[0].items():
+        torch.testing.assert_close(value, weights[1][name], atol=2e-4, rtol=1e-3)
