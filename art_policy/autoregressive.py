@@ -20,6 +20,7 @@ import torch
 from torch import Tensor, nn
 
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, KeyValueCache, initialise
+from art_policy.perception import PictureEncoder, ScanEncoder, pictures, scans
 from art_policy.sequence import ProblemBatch, SequenceBatch
 
 _N_STATE, _N_PERFORMANCE, _N_DISC, _N_TIME = 8, 13, 3, 33
@@ -44,7 +45,12 @@ class Autoregressive(nn.Module):
         width = config.width
         self.state_encoder = Encoder(_N_STATE, width)
         self.performance_encoder = Encoder(_N_PERFORMANCE, width)
-        self.disc_encoder = Encoder(_N_DISC, width)
+        if "vector" in config.modalities:
+            self.disc_encoder = Encoder(_N_DISC, width)
+        if "image" in config.modalities:
+            self.picture_encoder = PictureEncoder(width)
+        if "lidar" in config.modalities:
+            self.scan_encoder = ScanEncoder(width)
         self.control_encoder = Encoder(3, width)
         self.time_encoder = Encoder(_N_TIME, width)
         self.dropout = nn.Dropout(config.dropout)
@@ -87,6 +93,7 @@ class Autoregressive(nn.Module):
             batch.returns_to_go,
             batch.constraints_to_go,
             batch.time_to_go,
+            self.look(batch.problems),
         )
         control = self.embed_controls(batch.problems, batch.controls, batch.time_to_go)
         tokens = torch.cat([described, control], dim=2)  # (B, L, tokens a step, width)
@@ -118,15 +125,19 @@ class Autoregressive(nn.Module):
         returns_to_go: Tensor,
         constraints_to_go: Tensor,
         time_to_go: Tensor,
+        picture: Tensor | None = None,
     ) -> Tensor:
-        """Tokens of what is known before the control: ``(B, L, 3 or 1, width)``."""
+        """Tokens of what is known before the control: ``(B, L, 3 or 1, width)``.
+
+        ``picture`` is what :meth:`look` saw.
+        """
         budget = torch.stack([returns_to_go, constraints_to_go], dim=-1) / self.budget_scale
         parts = [
             self.state_encoder(self._state_features(problems, states)),
             self.performance_encoder(
                 self._performance_features(problems, states, budget, time_to_go)
             ),
-            self._embed_scene(problems, states, time_to_go),
+            self._embed_scene(problems, states, time_to_go, picture),
         ]
         if self.config.tokens_per_step == 2:
             parts = [torch.stack(parts).sum(0)]
@@ -207,15 +218,32 @@ class Autoregressive(nn.Module):
             dim=-1,
         )
 
-    def _embed_scene(self, problems: ProblemBatch, states: Tensor, time_to_go: Tensor) -> Tensor:
-        """``(B, L, width)``: the sum over the discs, whose order therefore does not matter."""
+    def look(self, problems: ProblemBatch) -> Tensor | None:
+        """``(B, width)`` of the top view at time zero; None for a model that sees no images."""
+        if "image" not in self.config.modalities:
+            return None
+        return self.picture_encoder(pictures(problems, self.config.table)).mean(1)
+
+    def _embed_scene(
+        self, problems: ProblemBatch, states: Tensor, time_to_go: Tensor, picture: Tensor | None
+    ) -> Tensor:
+        """``(B, L, width)``: the sum over the modalities, and over the discs, in no order."""
+        scene = torch.zeros(*states.shape[:2], self.config.width, device=states.device)
+        if picture is not None:
+            scene = scene + picture[:, None]
         discs = problems.discs_at(problems.final_time[:, None] - time_to_go)  # (B, L, M, 3)
-        offset = states[:, :, None, :2] - discs[..., :2]  # (B, L, M, 2)
-        clearance = offset.norm(dim=3, keepdim=True) - discs[..., 2:]
-        features = torch.cat([offset, clearance], dim=3)
-        if self.config.scene_descriptors == "absolute":
-            features = discs
-        return (self.disc_encoder(features) * problems.present[:, None, :, None]).sum(2)
+        if "lidar" in self.config.modalities:
+            poses = states[..., :3]
+            scene = scene + self.scan_encoder(poses, scans(poses, discs, self.config.table))
+        if "vector" in self.config.modalities:
+            offset = states[:, :, None, :2] - discs[..., :2]  # (B, L, M, 2)
+            clearance = offset.norm(dim=3, keepdim=True) - discs[..., 2:]
+            features = torch.cat([offset, clearance], dim=3)
+            if self.config.scene_descriptors == "absolute":
+                features = discs
+            present = problems.present[:, None, :, None]
+            scene = scene + (self.disc_encoder(features) * present).sum(2)
+        return scene
 
 
 def time_features(time_to_go: Tensor) -> Tensor:

@@ -61,6 +61,8 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
     """
     if not isinstance(model.net, MultiHypothesis):
         raise ValueError("Only multi-hypothesis models can be exported; this one generates steps.")
+    if model.config.modalities != ("vector",):
+        raise ValueError("Only models that know the discs can be exported; this one sees images.")
     try:
         import onnx
         import onnxscript  # noqa: F401  what torch exports with

@@ -17,6 +17,7 @@ HEADS = ("multi_hypothesis", "autoregressive")
 SCENE_DESCRIPTORS = ("relative", "absolute")
 DESCRIPTORS = ("goal", "reward_to_go", "constraint_to_go", "time_to_go")
 CONSTRAINT_TO_GO = ("decremented", "constant")
+MODALITIES = ("vector", "image", "lidar")
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,8 @@ class ARTConfig:
         width: Embedding dimension.
         n_layers: Number of transformer blocks.
         n_heads: Number of attention heads; divides ``width``.
+        modalities: How the scene is seen, one or several of ``"vector"`` (the discs), ``"image"``
+            (from above, at time zero) and ``"lidar"``.
         dropout: Dropout rate of attention, residual branches and embeddings.
         table: Size of the table in m, for which the positions are scaled.
         n_hypotheses: Multi-hypothesis only: number of proposals.
@@ -52,6 +55,7 @@ class ARTConfig:
     width: int = 192
     n_layers: int = 4
     n_heads: int = 6
+    modalities: tuple[str, ...] = ("vector",)
     dropout: float = 0.0
     table: tuple[float, float] = (3.5, 2.5)
     n_hypotheses: int = 6
@@ -70,12 +74,15 @@ class ARTConfig:
         self._require_choice("scene_descriptors", SCENE_DESCRIPTORS)
         self._require_choice("tokens_per_step", (2, 4))
         self._require_choice("constraint_to_go", CONSTRAINT_TO_GO)
-        object.__setattr__(self, "descriptors", tuple(self.descriptors))
-        if unknown := set(self.descriptors) - set(DESCRIPTORS):
-            raise ValueError(
-                f"ARTConfig.descriptors must be of {', '.join(map(repr, DESCRIPTORS))}, "
-                f"got {sorted(unknown)}."
-            )
+        for name, known in (("descriptors", DESCRIPTORS), ("modalities", MODALITIES)):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+            if unknown := set(getattr(self, name)) - set(known):
+                raise ValueError(
+                    f"ARTConfig.{name} must be of {', '.join(map(repr, known))}, "
+                    f"got {sorted(unknown)}."
+                )
+        if not self.modalities:
+            raise ValueError(f"ARTConfig.modalities needs one of {MODALITIES}.")
         for name in ("width", "n_layers", "n_heads", "n_hypotheses", "n_knots", "context_length"):
             if not getattr(self, name) >= 1:
                 raise ValueError(f"ARTConfig.{name} must be at least 1, got {getattr(self, name)}.")
@@ -110,7 +117,7 @@ class ARTConfig:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, for JSON; :meth:`from_dict` is its inverse."""
-        lists = {"table": list(self.table), "descriptors": list(self.descriptors)}
+        lists = {name: list(getattr(self, name)) for name in ("table", "descriptors", "modalities")}
         return {**dataclasses.asdict(self), **lists}
 
     @classmethod

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, initialise
+from art_policy.perception import PictureEncoder, ScanEncoder, pictures, scans
 from art_policy.sequence import ProblemBatch, random_discs, random_flags
 
 _N_PROBLEM_FEATURES = 20
@@ -133,7 +134,12 @@ class MultiHypothesis(nn.Module):
         super().__init__()
         self.config = config
         self.problem_encoder = Encoder(_N_PROBLEM_FEATURES, config.width)
-        self.disc_encoder = Encoder(_N_DISC_FEATURES, config.width)
+        if "vector" in config.modalities:
+            self.disc_encoder = Encoder(_N_DISC_FEATURES, config.width)
+        if "image" in config.modalities:
+            self.picture_encoder = PictureEncoder(config.width)
+        if "lidar" in config.modalities:
+            self.scan_encoder = ScanEncoder(config.width)
         self.query_embedding = nn.Parameter(torch.randn(config.n_hypotheses, config.width))
         self.dropout = nn.Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.n_layers))
@@ -150,15 +156,21 @@ class MultiHypothesis(nn.Module):
         """
         # Not len(problems), which would become a constant in an exported model.
         batch, n_queries = problems.start.shape[0], self.config.n_hypotheses
-        tokens = torch.cat(
-            [
-                self.query_embedding.expand(batch, -1, -1),
-                self.problem_encoder(problem_features(problems, self.config.table))[:, None],
-                self.disc_encoder(disc_features(problems, self.config.table)),
-            ],
-            dim=1,
-        )  # (B, H + 1 + M, width)
-        x, mask = self.dropout(tokens), _padding_mask(problems, n_queries + 1)
+        table, modalities = self.config.table, self.config.modalities
+        tokens = [
+            self.query_embedding.expand(batch, -1, -1),
+            self.problem_encoder(problem_features(problems, table))[:, None],
+        ]
+        if "image" in modalities:
+            tokens.append(self.picture_encoder(pictures(problems, table)))
+        if "lidar" in modalities:
+            poses, discs = problems.start[:, None, :3], problems.discs[:, None, :, :3]
+            tokens.append(self.scan_encoder(poses, scans(poses, discs, table)))
+        mask = None
+        if "vector" in modalities:
+            mask = _padding_mask(problems, sum(part.shape[1] for part in tokens))
+            tokens.append(self.disc_encoder(disc_features(problems, table)))
+        x = self.dropout(torch.cat(tokens, dim=1))  # (B, H + 1 + scene tokens, width)
         for block in self.blocks[:-1]:
             x = block(x, mask=mask)
         x = self.blocks[-1](x, mask=mask, n_queries=n_queries)  # (B, H, width)

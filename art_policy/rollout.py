@@ -178,10 +178,13 @@ def generate(
     # No violation is asked for. Nor is a budget overdrawn after one: no example ever showed that.
     budget = np.zeros(len(problems))
     cache = KeyValueCache() if use_cache else None
+    picture = net.look(batch)
     tokens, controls = torch.empty(len(problems), 0, net.config.width, device=device), []
     for _ in range(max(problem.n_steps for problem in problems)):
-        inputs = (_column(x, device) for x in (state, returns, budget, time_to_go))
-        new = net.embed_descriptors(batch, *inputs).flatten(1, 2)
+        x, reward, constraint, left = (
+            _column(values, device) for values in (state, returns, budget, time_to_go)
+        )
+        new = net.embed_descriptors(batch, x, reward, constraint, left, picture).flatten(1, 2)
         tokens = torch.cat([tokens, new], dim=1)
         x = net.transform(tokens, cache)[:, -1]
         control = (net.control_decoder(x) * net.control_scale).double().cpu().numpy()
