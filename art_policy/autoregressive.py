@@ -18,6 +18,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, KeyValueCache, initialise
 from art_policy.perception import PictureEncoder, ScanEncoder, pictures, scans
@@ -25,6 +26,7 @@ from art_policy.sequence import ProblemBatch, SequenceBatch
 
 _N_STATE, _N_PERFORMANCE, _N_DISC, _N_TIME = 8, 13, 3, 33
 _TIME_SCALE = 40.0  # s
+_IDLE_WEIGHT, _MODE_WEIGHT = 0.02, 0.1  # of the loss of several modes
 
 
 class Autoregressive(nn.Module):
@@ -55,7 +57,10 @@ class Autoregressive(nn.Module):
         self.time_encoder = Encoder(_N_TIME, width)
         self.dropout = nn.Dropout(config.dropout)
         self.blocks = nn.ModuleList(Block(config) for _ in range(config.n_layers))
-        self.control_decoder = Decoder(width, 3)
+        modes = config.n_modes
+        self.control_decoder = Decoder(width, 3 * modes)
+        if modes > 1:
+            self.mode_decoder = Decoder(width, modes)
         self.outcome_decoder = Decoder(width, 7)  # change of state, time-to-go
         self.register_buffer("rate_scale", torch.tensor([0.1, 0.1, 0.1]))
         self.register_buffer("change_scale", torch.full((6,), 0.05))
@@ -83,9 +88,17 @@ class Autoregressive(nn.Module):
         """Teacher forcing: predictions at every step.
 
         Returns:
-            Normalised controls ``(B, L, 3)`` and outcomes ``(B, L, 7)``: the normalised change of
-            the state, then the time-to-go in units of 40 s.
+            Normalised controls ``(B, L, 3)``, the most probable ones if there are several, and
+            outcomes ``(B, L, 7)``: the normalised change of the state, then the time-to-go in units
+            of 40 s.
         """
+        x = self._tokens(batch)
+        modes, logits = self.decode_controls(x[:, :, -2])
+        index = logits.argmax(-1, keepdim=True)[..., None].expand(*logits.shape[:-1], 1, 3)
+        return modes.gather(-2, index).squeeze(-2), self.outcome_decoder(x[:, :, -1])
+
+    def _tokens(self, batch: SequenceBatch) -> Tensor:
+        """What the transformer makes of the tokens, ``(B, L, tokens a step, width)``."""
         size, length = batch.valid.shape
         described = self.embed_descriptors(
             batch.problems,
@@ -97,8 +110,14 @@ class Autoregressive(nn.Module):
         )
         control = self.embed_controls(batch.problems, batch.controls, batch.time_to_go)
         tokens = torch.cat([described, control], dim=2)  # (B, L, tokens a step, width)
-        x = self.transform(tokens.flatten(1, 2)).view(size, length, -1, self.config.width)
-        return self.control_decoder(x[:, :, -2]), self.outcome_decoder(x[:, :, -1])
+        return self.transform(tokens.flatten(1, 2)).view(size, length, -1, self.config.width)
+
+    def decode_controls(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Normalised controls ``(..., n_modes, 3)`` of tokens ``(..., width)``, and logits."""
+        modes = self.control_decoder(x).unflatten(-1, (self.config.n_modes, 3))
+        if self.config.n_modes == 1:
+            return modes, torch.zeros_like(modes[..., 0])
+        return modes, self.mode_decoder(x)
 
     def transform(self, tokens: Tensor, cache: KeyValueCache | None = None) -> Tensor:
         """Runs the transformer over tokens ``(B, L, width)`` that follow those in the cache.
@@ -154,20 +173,36 @@ class Autoregressive(nn.Module):
     def loss(self, batch: SequenceBatch) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean squared errors of control and state, and of the time-to-go if configured.
 
+        With several modes, the one nearest to the control is drawn towards it, the others a little,
+        and their probabilities are trained to name the nearest one.
+
         Returns:
-            The loss, and its parts to log.
+            The loss, and its parts to log; with several modes also ``chosen_loss``, the error of
+            the most probable one.
         """
-        control, outcome = self(batch)
+        x = self._tokens(batch)
+        modes, logits = self.decode_controls(x[:, :, -2])
+        outcome = self.outcome_decoder(x[:, :, -1])
         change = (batch.next_states - batch.states) / self.change_scale
         time = batch.time_to_go[..., None] / _TIME_SCALE
         weight = batch.valid / batch.valid.sum()
-        figures = {
-            "control_loss": _mean_square(control - batch.controls / self.control_scale, weight),
-            "state_loss": _mean_square(outcome[..., :6] - change, weight),
-        }
+        target = (batch.controls / self.control_scale)[..., None, :]
+        errors = (modes - target).square().mean(-1)  # (B, L, n_modes)
+        nearest, owner = errors.min(-1)
+        figures = {"control_loss": (nearest * weight).sum()}
+        loss = figures["control_loss"]
+        if self.config.n_modes > 1:
+            choice = F.cross_entropy(logits.flatten(0, 1), owner.flatten(), reduction="none")
+            figures["mode_loss"] = (choice.view_as(weight) * weight).sum()
+            chosen = errors.gather(-1, logits.argmax(-1, keepdim=True)).squeeze(-1)
+            figures["chosen_loss"] = (chosen * weight).sum()
+            idle = (errors.mean(-1) * weight).sum()
+            loss = loss + _IDLE_WEIGHT * idle + _MODE_WEIGHT * figures["mode_loss"]
+        figures["state_loss"] = _mean_square(outcome[..., :6] - change, weight)
+        loss = loss + figures["state_loss"]
         if self.config.predict_time_to_go:
             figures["time_loss"] = _mean_square(outcome[..., 6:] - time, weight)
-        loss = torch.stack(list(figures.values())).sum()
+            loss = loss + figures["time_loss"]
         return loss, {name: value.detach() for name, value in figures.items()}
 
     def _state_features(self, problems: ProblemBatch, states: Tensor) -> Tensor:

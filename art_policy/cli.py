@@ -10,6 +10,7 @@ import argparse
 import logging
 import os
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,8 +36,9 @@ DEFAULT_MODEL = "art-scene-random"
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point of the ``freeflyer`` script; returns the exit code."""
     parser = _parser()
-    options = parser.parse_args(arguments)
-    options.given = set(arguments if arguments is not None else sys.argv[1:])
+    words = list(arguments if arguments is not None else sys.argv[1:])
+    options = parser.parse_args(words)
+    options.given, options.line = set(words), shlex.join(["freeflyer", *words])
     logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stderr)
     try:
         return options.run(options) or 0

@@ -87,7 +87,7 @@ def evaluate_models(options: argparse.Namespace) -> None:
         progress=not options.json,
         partial=partial,
     )
-    data = report(records, options.models, quick=options.quick)
+    data = report(records, options.models, options.line)
     if partial:
         save_report(data, Path(options.out))
         partial.unlink()

@@ -41,6 +41,9 @@ class ARTConfig:
             control), or 2 (the three descriptors summed into one token, control).
         scene_descriptors: Autoregressive only: ``"relative"`` or ``"absolute"`` obstacles
             (paper, Sec. IV-C, question 3).
+        n_modes: Autoregressive only: number of controls that are predicted at each step, each with
+            a probability. 1 is the paper's; more keep two ways round an obstacle from being
+            averaged to one through it.
         descriptors: Autoregressive only: the performance descriptors that are read (paper, Sec.
             III-A), any of ``"goal"``, ``"reward_to_go"``, ``"constraint_to_go"``, ``"time_to_go"``.
             Without the last, steps are told apart by the time since the start.
@@ -63,6 +66,7 @@ class ARTConfig:
     context_length: int = 100
     tokens_per_step: int = 4
     scene_descriptors: str = "relative"
+    n_modes: int = 1
     descriptors: tuple[str, ...] = DESCRIPTORS
     constraint_to_go: str = "decremented"
     predict_time_to_go: bool = False
@@ -83,7 +87,9 @@ class ARTConfig:
                 )
         if not self.modalities:
             raise ValueError(f"ARTConfig.modalities needs one of {MODALITIES}.")
-        for name in ("width", "n_layers", "n_heads", "n_hypotheses", "n_knots", "context_length"):
+        for name in (
+            "width", "n_layers", "n_heads", "n_hypotheses", "n_knots", "context_length", "n_modes"
+        ):  # fmt: skip
             if not getattr(self, name) >= 1:
                 raise ValueError(f"ARTConfig.{name} must be at least 1, got {getattr(self, name)}.")
         if self.width % self.n_heads:

@@ -123,7 +123,8 @@ def decode_poses(problem: Problem, knots: FloatArray) -> FloatArray:
 
 
 #: Candidates of an autoregressive model ask for REL's cost times 1, 1.05, 1.1 ...: REL's cost is a
-#: lower bound, which the obstacles may put out of reach.
+#: lower bound, which the obstacles may put out of reach. Those after the first are sampled if the
+#: model has several modes.
 _COST_STEP = 0.05
 
 
@@ -133,9 +134,10 @@ def _sequences(
     factors = 1.0 + _COST_STEP * np.arange(n_candidates)
     tasks = [problem for problem in problems for _ in factors]
     returns = -np.outer(rel_costs, factors).ravel()
+    draws = list(range(n_candidates)) * len(problems)
     proposals = [
         _judge(problem, Trajectory.from_controls(problem, controls))
-        for problem, controls in zip(tasks, generate(net, tasks, returns))
+        for problem, controls in zip(tasks, generate(net, tasks, returns, draws=draws))
     ]
     groups = [proposals[i : i + n_candidates] for i in range(0, len(proposals), n_candidates)]
     return [sorted(group, key=lambda proposal: -proposal.score) for group in groups]
@@ -153,6 +155,7 @@ def generate(
     problems: Sequence[Problem],
     returns_to_go: FloatArray,
     *,
+    draws: Sequence[int] | None = None,
     use_cache: bool = True,
 ) -> list[FloatArray]:
     """Model-based autoregressive generation (paper, Sec. III-C): known dynamics give the states.
@@ -161,6 +164,8 @@ def generate(
         net: The network.
         problems: ``B`` problems; their final times may differ.
         returns_to_go: ``(B,)`` rewards-to-go at the start, minus the cost asked for, in m/s.
+        draws: ``(B,)`` numbers of samples from the model's modes, the same in every call; 0, and by
+            default, the most probable controls.
         use_cache: Whether to keep keys and values of the past, or to run the whole sequence again
             at every step (slow; the same result).
 
@@ -179,15 +184,18 @@ def generate(
     budget = np.zeros(len(problems))
     cache = KeyValueCache() if use_cache else None
     picture = net.look(batch)
+    longest = max(problem.n_steps for problem in problems)
+    noise = _mode_noise(draws or [0] * len(problems), longest, net.config.n_modes).to(device)
     tokens, controls = torch.empty(len(problems), 0, net.config.width, device=device), []
-    for _ in range(max(problem.n_steps for problem in problems)):
+    for step in range(longest):
         x, reward, constraint, left = (
             _column(values, device) for values in (state, returns, budget, time_to_go)
         )
         new = net.embed_descriptors(batch, x, reward, constraint, left, picture).flatten(1, 2)
         tokens = torch.cat([tokens, new], dim=1)
-        x = net.transform(tokens, cache)[:, -1]
-        control = (net.control_decoder(x) * net.control_scale).double().cpu().numpy()
+        modes, logits = net.decode_controls(net.transform(tokens, cache)[:, -1])
+        chosen = modes[torch.arange(len(modes)), (logits + noise[:, step]).argmax(1)]
+        control = (chosen * net.control_scale).double().cpu().numpy()
         control = _within_limits(problems[0].scenario, state, control)
         last = net.embed_controls(batch, _column(control, device), _column(time_to_go, device))
         last = last.flatten(1, 2)
@@ -198,6 +206,16 @@ def generate(
         controls.append(control)
     table = np.stack(controls, axis=1)  # (B, longest N, 3)
     return [row[: problem.n_steps] for row, problem in zip(table, problems)]
+
+
+def _mode_noise(draws: Sequence[int], n_steps: int, n_modes: int) -> Tensor:
+    """``(B, n_steps, n_modes)`` added to logits, their largest is a sample; none for draw 0."""
+    noise = {
+        draw: np.random.default_rng(draw).gumbel(size=(n_steps, n_modes)) if draw else 0.0
+        for draw in set(draws)
+    }
+    rows = [np.broadcast_to(noise[draw], (n_steps, n_modes)) for draw in draws]
+    return torch.from_numpy(np.array(rows, dtype=np.float32))
 
 
 def _column(values: FloatArray, device: torch.device) -> Tensor:

@@ -1,6 +1,7 @@
 """Writes the tables of the pages from the evaluations in ``docs/results``.
 
-``python docs/tables.py`` does it; a test sees to it that it was done.
+``python docs/tables.py`` does it, ``python docs/tables.py out/report.json`` puts a new evaluation
+there first; a test sees to it that it was done.
 A page says where a table comes from in a comment, and this script fills in what is behind it::
 
     <!-- table: docs/results/held_out.json | all | REL; ART; ART, best of 4 -->
@@ -13,6 +14,7 @@ that is a report of ``freeflyer evaluate``, a group of its problems, and the met
 
 from __future__ import annotations
 
+import argparse
 import json
 import math
 import re
@@ -22,6 +24,7 @@ from typing import Any
 from art_policy.evaluation import markdown_table
 
 ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "docs" / "results"
 PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").rglob("*.md")),
@@ -75,7 +78,15 @@ def _grid(groups: dict[str, Any], base: str, method: str) -> str:
 
 
 def main() -> None:
-    """Fills in the tables of all pages."""
+    """Adds reports if there are any, and fills in the tables of all pages."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    text = "report of freeflyer evaluate to put into docs/results, without its single problems"
+    parser.add_argument("reports", nargs="*", type=Path, help=text)
+    for path in parser.parse_args().reports:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        data.pop("records", None)
+        kept = RESULTS / path.name
+        kept.write_text(json.dumps(data, indent=1) + "\n", encoding="utf-8")
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         if (new := filled(text)) != text:

@@ -118,14 +118,14 @@ def _improvements(
 
 
 def report(
-    records: Sequence[ProblemRecord], model: str | Sequence[str], **settings: Any
+    records: Sequence[ProblemRecord], model: str | Sequence[str], command: str = ""
 ) -> dict[str, Any]:
     """What ``freeflyer evaluate`` writes to JSON: figures for all problems and by group.
 
     Args:
         records: Of all problems.
         model: The models' names.
-        settings: What else should be known about the evaluation.
+        command: The command that made it, for whoever reads the report later.
     """
     groups = {"all": list(records)}
     for scene in sorted({r.scene for r in records}):
@@ -145,7 +145,7 @@ def report(
         groups[name] = [r for r in records if (r.n_obstacles, r.final_time) == cell]
     return {
         "model": model if isinstance(model, str) else list(model),
-        "settings": settings,
+        "command": command,
         "machine": {"processor": platform.machine(), "python": platform.python_version()},
         "paper": PAPER,
         "groups": {name: summarise(group) for name, group in groups.items() if group},

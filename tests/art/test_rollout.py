@@ -17,6 +17,7 @@ from freeflyer_env.planning import solve_rel, solve_scp
 
 MULTI = ARTConfig(width=32, n_layers=1, n_heads=2, n_hypotheses=4)
 SEQUENCE = replace(MULTI, head="autoregressive", context_length=8)
+MODES = replace(SEQUENCE, n_modes=4)
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +129,19 @@ def test_the_reward_to_go_changes_what_is_generated(problems: list[Problem]) -> 
     net = model(SEQUENCE).net
     low, high = generate(net, [problems[0]] * 2, np.array([-0.2, -0.6]))
     assert np.abs(low - high).max() > 1e-6
+
+
+def test_samples_of_a_model_with_modes(problems: list[Problem]) -> None:
+    net = model(MODES).net
+    returns = np.full(3, -0.3)
+    same = generate(net, [problems[0]] * 3, returns, draws=[0, 1, 2])
+    assert np.abs(same[0] - same[1]).max() > 1e-6
+    assert np.abs(same[1] - same[2]).max() > 1e-6
+    alone = generate(net, [problems[0]], returns[:1], draws=[2])
+    np.testing.assert_allclose(alone[0], same[2], atol=1e-7)
+    together = generate(net, problems, returns, draws=[2, 1, 0])
+    np.testing.assert_allclose(together[0], same[2], atol=1e-7)
+    np.testing.assert_allclose(generate(net, problems[:1], returns[:1])[0], same[0], atol=1e-7)
 
 
 def test_bad_requests(problems: list[Problem]) -> None:

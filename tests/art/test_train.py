@@ -26,7 +26,11 @@ from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
 TINY_SEQUENCE = replace(TINY, head="autoregressive", context_length=12, tokens_per_step=2)
-HEADS = pytest.mark.parametrize("model", [TINY, TINY_SEQUENCE], ids=lambda config: config.head)
+HEADS = pytest.mark.parametrize(
+    "model",
+    [TINY, TINY_SEQUENCE, replace(TINY_SEQUENCE, n_modes=3)],
+    ids=["hypotheses", "sequence", "modes"],
+)
 
 SHORT = TrainConfig(max_steps=6, batch_size=8, log_every=2, validate_every=4, precision="float32")
 
@@ -81,8 +85,9 @@ def test_hypotheses_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) -
     assert rows[-1]["agreement"] > 0.8
 
 
-def test_sequences_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) -> None:
-    model = replace(TINY_SEQUENCE, width=64, dropout=0.0, context_length=40)
+@pytest.mark.parametrize("n_modes", [1, 3])
+def test_sequences_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path, n_modes: int) -> None:
+    model = replace(TINY_SEQUENCE, width=64, dropout=0.0, context_length=40, n_modes=n_modes)
     config = replace(SHORT, max_steps=300, batch_size=8, learning_rate=3e-3, ema_decay=0.9,
                      augment=False, log_every=50, validate_every=1000)  # fmt: skip
     train(dataset, model, config, tmp_path)
