@@ -15,6 +15,7 @@ than the context.
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor, nn
@@ -23,6 +24,9 @@ from torch.nn import functional as F
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, KeyValueCache, initialise
 from art_policy.perception import PictureEncoder, ScanEncoder, pictures, scans
 from art_policy.sequence import ProblemBatch, SequenceBatch
+
+if TYPE_CHECKING:
+    from art_policy.generation import TorchSteps
 
 _N_STATE, _N_PERFORMANCE, _N_DISC, _N_TIME = 8, 13, 3, 33
 _TIME_SCALE = 40.0  # s
@@ -118,6 +122,12 @@ class Autoregressive(nn.Module):
         if self.config.n_modes == 1:
             return modes, torch.zeros_like(modes[..., 0])
         return modes, self.mode_decoder(x)
+
+    def steps(self, problems: ProblemBatch, use_cache: bool = True) -> TorchSteps:
+        """One step after the other, for :func:`art_policy.generation.generate`."""
+        from art_policy.generation import TorchSteps
+
+        return TorchSteps(self, problems, use_cache)
 
     def transform(self, tokens: Tensor, cache: KeyValueCache | None = None) -> Tensor:
         """Runs the transformer over tokens ``(B, L, width)`` that follow those in the cache.

@@ -16,14 +16,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from art_policy.layers import ARTConfig
+from art_policy.autoregressive import Autoregressive
+from art_policy.layers import ARTConfig, KeyValueCache
 from art_policy.multi_hypothesis import MultiHypothesis
 from art_policy.sequence import ProblemBatch
+from freeflyer_env.robot import FloatArray
 
 if TYPE_CHECKING:
     from art_policy.model import ART
 
 _INPUTS, _OUTPUTS = ("start", "goal", "discs", "final_time"), ("knots", "scores")
+_STEP_INPUTS = (*_INPUTS, "state", "returns", "budget", "time_to_go", "control", "control_time",
+                "keys", "values", "known")  # fmt: skip
+_STEP_OUTPUTS = ("controls", "logits", "keys_out", "values_out")
 _CONFIG_KEY = "art_config"
 _OPSET = 18
 
@@ -41,13 +46,53 @@ class _Plain(nn.Module):
         return self.net(ProblemBatch(start, goal, discs, final_time))
 
 
-def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
-    """Writes a multi-hypothesis model as ONNX.
+class _Step(nn.Module):
+    """One step of an autoregressive network: the last control, then what is known before the next.
 
-    Inputs are ``start`` and ``goal`` ``(B, 6)``, ``discs`` ``(B, M, 5)`` with rows ``(x, y,
+    ``keys`` and ``values`` ``(layers, B, heads, P, width / heads)`` are of the ``P`` tokens before;
+    ``known`` ``(P + tokens of a step,)`` is False where there is nothing yet.
+    """
+
+    def __init__(self, net: Autoregressive) -> None:
+        super().__init__()
+        self.net = net
+
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        given = dict(zip(_STEP_INPUTS, inputs))
+        net, known = self.net, given["known"]
+        problems = ProblemBatch(*(given[name] for name in _INPUTS))
+        moment = (given[name][:, None] for name in ("state", "returns", "budget", "time_to_go"))
+        state, returns, budget, time_to_go = moment
+        control, control_time = given["control"][:, None], given["control_time"][:, None]
+        tokens = torch.cat(
+            [
+                net.embed_controls(problems, control, control_time).flatten(1, 2),
+                net.embed_descriptors(problems, state, returns, budget, time_to_go).flatten(1, 2),
+            ],
+            dim=1,
+        )
+        count = tokens.shape[1]
+        past = known.shape[0] - count
+        here = past + torch.arange(count)[:, None]
+        there = torch.arange(known.shape[0])[None]
+        seen = (there <= here) & (here - there < net.window) & known | (there == here)
+        cache = KeyValueCache(list(given["keys"].unbind(0)), list(given["values"].unbind(0)))
+        for layer, block in enumerate(net.blocks):
+            tokens = block(tokens, mask=seen, cache=cache, layer=layer)
+        modes, logits = net.decode_controls(tokens[:, -1])
+        keys, values = torch.stack(cache.keys), torch.stack(cache.values)
+        return modes * net.control_scale, logits, keys, values
+
+
+def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
+    """Writes a model as ONNX; of an autoregressive one, a step, with keys and values of the past.
+
+    The inputs are ``start`` and ``goal`` ``(B, 6)``, ``discs`` ``(B, M, 5)`` with rows ``(x, y,
     keep-out radius, v_x, v_y)``, radius zero for padding, and ``final_time`` ``(B,)``, float32 in
-    SI units; outputs are ``knots`` ``(B, H, n_knots, 3)`` and ``scores`` ``(B, H)``. Any ``B`` and
-    ``M`` do.
+    SI units; the outputs of a multi-hypothesis model are ``knots`` ``(B, H, n_knots, 3)`` and
+    ``scores`` ``(B, H)``. Any ``B`` and ``M`` do. An autoregressive model also takes what is known
+    at the present step, and the keys and values of the past, which it gives back with those of the
+    step added: ``_Step`` in this module says which, :class:`OnnxSteps` feeds them.
 
     Args:
         model: What to export.
@@ -56,11 +101,9 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
             changes in the shipped model is told on its card.
 
     Raises:
-        ValueError: If the model is autoregressive, whose generation is a loop over steps.
+        ValueError: If the model sees images or scans.
         ModuleNotFoundError: Without ``onnx`` and ``onnxscript``.
     """
-    if not isinstance(model.net, MultiHypothesis):
-        raise ValueError("Only multi-hypothesis models can be exported; this one generates steps.")
     if model.config.modalities != ("vector",):
         raise ValueError("Only models that know the discs can be exported; this one sees images.")
     try:
@@ -73,7 +116,7 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     # Two problems, one with padding, so that nothing is taken for a constant.
-    example = (
+    example: tuple[Tensor, ...] = (
         torch.tensor([[0.3, 1.0, 0.1, 0.0, 0.0, 0.0], [0.2, 2.0, 1.0, 0.0, 0.0, 0.0]]),
         torch.tensor([[3.2, 1.5, 0.5, 0.0, 0.0, 0.0], [3.3, 0.5, 2.0, 0.0, 0.0, 0.0]]),
         torch.tensor(
@@ -84,24 +127,38 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
         ),
         torch.tensor([40.0, 60.0]),
     )
-    batch, count = torch.export.Dim("batch"), torch.export.Dim("discs")
+    batch, count, past = (torch.export.Dim(name) for name in ("batch", "discs", "past"))
+    shapes: list[dict[int, Any]] = [{0: batch}, {0: batch}, {0: batch, 1: count}, {0: batch}]
+    plain: nn.Module
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    if isinstance(model.net, MultiHypothesis):
+        plain, inputs, outputs = _Plain(model.net), _INPUTS, _OUTPUTS
+    else:
+        plain, inputs, outputs = _Step(model.net), _STEP_INPUTS, _STEP_OUTPUTS
+        config = model.config
+        cached = torch.zeros(config.n_layers, 2, config.n_heads, 5, config.width // config.n_heads)
+        known = torch.ones(5 + config.tokens_per_step, dtype=torch.bool)
+        rows = torch.zeros(2)
+        # Each input a tensor of its own: one that stood twice would be taken for one input.
+        time = example[3]
+        example += (example[0].clone(), rows - 0.2, rows, time.clone())
+        example += (torch.zeros(2, 3), time.clone(), cached, cached.clone(), known)
+        shapes += [{0: batch}] * 6 + [{1: batch, 3: past}] * 2
+        shapes.append({0: past + config.tokens_per_step})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of axes that share a name, and of torchvision
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         program = torch.onnx.export(
-            _Plain(model.net).eval(),
+            plain.eval(),
             example,
             dynamo=True,
             verbose=False,
             opset_version=_OPSET,
-            input_names=_INPUTS,
-            output_names=_OUTPUTS,
-            dynamic_shapes={
-                "start": {0: batch},
-                "goal": {0: batch},
-                "discs": {0: batch, 1: count},
-                "final_time": {0: batch},
-            },
+            input_names=inputs,
+            output_names=outputs,
+            # A forward with *inputs has one argument, a tuple.
+            dynamic_shapes=(tuple(shapes),) if isinstance(plain, _Step) else tuple(shapes),
         )
     assert program is not None
     proto = program.model_proto
@@ -122,14 +179,15 @@ def _quantise(path: Path) -> None:
     logging.disable(logging.WARNING)  # it has no say in what is not quantised
     try:
         quant_pre_process(str(path), str(prepared), skip_symbolic_shape=True)
-        quantize_dynamic(prepared, path, weight_type=QuantType.QInt8, per_channel=True)
+        # Unsigned: products of signed and unsigned bytes saturate on processors without VNNI.
+        quantize_dynamic(prepared, path, weight_type=QuantType.QUInt8, per_channel=True)
     finally:
         logging.disable(logging.NOTSET)
         prepared.unlink(missing_ok=True)
 
 
 class OnnxART:
-    """An exported model, to be used wherever a multi-hypothesis :class:`ART` is.
+    """An exported model, to be used wherever an :class:`ART` is.
 
     Args:
         path: What :func:`export_onnx` wrote.
@@ -169,10 +227,58 @@ class OnnxART:
             raise ValueError(f"{str(path)!r} was not written by freeflyer export.")
         self.config = ARTConfig.from_dict(json.loads(metadata[_CONFIG_KEY]))
 
+    def steps(self, problems: ProblemBatch, use_cache: bool = True) -> OnnxSteps:
+        """One step after the other (autoregressive models), always with a cache."""
+        return OnnxSteps(self._session, self.config, problems)
+
     def __call__(self, problems: ProblemBatch) -> tuple[Tensor, Tensor]:
         """As :meth:`MultiHypothesis.forward`."""
-        inputs = {name: getattr(problems, name).numpy() for name in _INPUTS}
-        if not inputs["discs"].shape[1]:
-            inputs["discs"] = np.zeros((len(problems), 1, 5), dtype=np.float32)
-        knots, scores = self._session.run(list(_OUTPUTS), inputs)
+        knots, scores = self._session.run(list(_OUTPUTS), _arrays(problems))
         return torch.from_numpy(knots), torch.from_numpy(scores)
+
+
+class OnnxSteps:
+    """The steps of an exported autoregressive model."""
+
+    def __init__(self, session: Any, config: ARTConfig, problems: ProblemBatch) -> None:
+        self._session, self._tokens = session, config.tokens_per_step
+        self._longest = config.context_length * config.tokens_per_step - 1
+        self._inputs = _arrays(problems)
+        size, head = len(problems), config.width // config.n_heads
+        # The runtime dislikes empty tensors: one token that nobody sees.
+        cached = np.zeros((config.n_layers, size, config.n_heads, 1, head), dtype=np.float32)
+        self._inputs |= {
+            "keys": cached,
+            "values": cached,
+            "known": np.zeros(1, dtype=bool),
+            "control": np.zeros((size, 3), dtype=np.float32),
+            "control_time": self._inputs["final_time"],
+        }
+        self._control_known = False
+
+    def predict(
+        self, state: FloatArray, returns: FloatArray, budget: FloatArray, time_to_go: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`art_policy.generation.Steps.predict`."""
+        inputs, tokens = self._inputs, self._tokens
+        moment = {"state": state, "returns": returns, "budget": budget, "time_to_go": time_to_go}
+        inputs |= {name: value.astype(np.float32) for name, value in moment.items()}
+        known = np.ones(len(inputs["known"]) + tokens, dtype=bool)
+        known[:-tokens] = inputs["known"]
+        known[-tokens] = self._control_known
+        controls, logits, keys, values = self._session.run(None, {**inputs, "known": known})
+        last = self._longest
+        inputs |= {"keys": keys[:, :, :, -last:], "values": values[:, :, :, -last:]}
+        inputs |= {"known": known[-last:], "control_time": inputs["time_to_go"]}
+        return controls.astype(np.float64), logits
+
+    def apply(self, control: FloatArray) -> None:
+        """As :meth:`art_policy.generation.Steps.apply`."""
+        self._inputs["control"], self._control_known = control.astype(np.float32), True
+
+
+def _arrays(problems: ProblemBatch) -> dict[str, Any]:
+    inputs = {name: getattr(problems, name).numpy() for name in _INPUTS}
+    if not inputs["discs"].shape[1]:
+        inputs["discs"] = np.zeros((len(problems), 1, 5), dtype=np.float32)
+    return inputs

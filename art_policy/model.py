@@ -17,6 +17,8 @@ from art_policy.multi_hypothesis import MultiHypothesis
 
 if TYPE_CHECKING:
     from art_policy.deployment import OnnxART
+    from art_policy.generation import TorchSteps
+    from art_policy.sequence import ProblemBatch
 
 PRETRAINED_DIR = Path(__file__).parent / "pretrained"
 WEIGHTS_NAME, CONFIG_NAME = "model.safetensors", "config.json"
@@ -43,6 +45,11 @@ class ART(nn.Module):
     def forward(self, *args: Any, **kwargs: Any) -> Any:
         """The head's forward pass."""
         return self.net(*args, **kwargs)
+
+    def steps(self, problems: ProblemBatch, use_cache: bool = True) -> TorchSteps:
+        """One step after the other (autoregressive head)."""
+        assert isinstance(self.net, Autoregressive)
+        return self.net.steps(problems, use_cache)
 
     @property
     def num_parameters(self) -> int:

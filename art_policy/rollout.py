@@ -8,17 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from art_policy.autoregressive import Autoregressive
-from art_policy.layers import KeyValueCache
+from art_policy.generation import SteppedModel, generate
 from art_policy.multi_hypothesis import interpolation_matrix
 from art_policy.sequence import ProblemBatch
-from freeflyer_env import dynamics
 from freeflyer_env.planning.homotopy import push_out
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
-from freeflyer_env.scenario import Problem, Scenario
+from freeflyer_env.scenario import Problem
 
 if TYPE_CHECKING:
     from art_policy.deployment import OnnxART
@@ -70,13 +67,13 @@ def propose_batch(
         raise ValueError(f"n_candidates must be at least 1, got {n_candidates}.")
     if not problems:
         return []
-    if isinstance(model.net, Autoregressive):
+    if model.config.head == "autoregressive":
         if rels is None or len(rels) != len(problems):
             raise ValueError(
                 "An autoregressive model needs REL's trajectory of each problem for its "
                 "reward-to-go; pass rel=solve_rel(problem).trajectory."
             )
-        return _sequences(model.net, problems, n_candidates, [rel.cost for rel in rels])
+        return _sequences(model, problems, n_candidates, [rel.cost for rel in rels])
     return _hypotheses(model, problems, n_candidates)
 
 
@@ -129,7 +126,7 @@ _COST_STEP = 0.05
 
 
 def _sequences(
-    net: Autoregressive, problems: Sequence[Problem], n_candidates: int, rel_costs: Sequence[float]
+    model: SteppedModel, problems: Sequence[Problem], n_candidates: int, rel_costs: Sequence[float]
 ) -> list[list[Proposal]]:
     factors = 1.0 + _COST_STEP * np.arange(n_candidates)
     tasks = [problem for problem in problems for _ in factors]
@@ -137,7 +134,7 @@ def _sequences(
     draws = list(range(n_candidates)) * len(problems)
     proposals = [
         _judge(problem, Trajectory.from_controls(problem, controls))
-        for problem, controls in zip(tasks, generate(net, tasks, returns, draws=draws))
+        for problem, controls in zip(tasks, generate(model, tasks, returns, draws=draws))
     ]
     groups = [proposals[i : i + n_candidates] for i in range(0, len(proposals), n_candidates)]
     return [sorted(group, key=lambda proposal: -proposal.score) for group in groups]
@@ -147,84 +144,3 @@ def _judge(problem: Problem, trajectory: Trajectory) -> Proposal:
     """Scores a generated trajectory by its violating nodes and its miss of the goal."""
     miss = np.linalg.norm(trajectory.states[-1, :2] - problem.goal[:2])
     return Proposal(trajectory, -float(trajectory.violations(problem).sum() + 10.0 * miss))
-
-
-@torch.inference_mode()
-def generate(
-    net: Autoregressive,
-    problems: Sequence[Problem],
-    returns_to_go: FloatArray,
-    *,
-    draws: Sequence[int] | None = None,
-    use_cache: bool = True,
-) -> list[FloatArray]:
-    """Model-based autoregressive generation (paper, Sec. III-C): known dynamics give the states.
-
-    Args:
-        net: The network.
-        problems: ``B`` problems; their final times may differ.
-        returns_to_go: ``(B,)`` rewards-to-go at the start, minus the cost asked for, in m/s.
-        draws: ``(B,)`` numbers of samples from the model's modes, the same in every call; 0, and by
-            default, the most probable controls.
-        use_cache: Whether to keep keys and values of the past, or to run the whole sequence again
-            at every step (slow; the same result).
-
-    Returns:
-        Controls ``(N, 3)`` of each problem, within the actuation limit.
-    """
-    device = net.control_scale.device
-    batch = ProblemBatch.from_problems(problems).to(device)
-    dt, robot = problems[0].scenario.dt, problems[0].scenario.robot
-    if any((p.scenario.dt, p.scenario.robot) != (dt, robot) for p in problems):
-        raise ValueError("Problems that are generated together must share the robot and the step.")
-    state = np.array([problem.start for problem in problems])
-    time_to_go = np.array([problem.final_time for problem in problems])
-    returns = np.array(returns_to_go, dtype=np.float64)
-    # No violation is asked for. Nor is a budget overdrawn after one: no example ever showed that.
-    budget = np.zeros(len(problems))
-    cache = KeyValueCache() if use_cache else None
-    picture = net.look(batch)
-    longest = max(problem.n_steps for problem in problems)
-    noise = _mode_noise(draws or [0] * len(problems), longest, net.config.n_modes).to(device)
-    tokens, controls = torch.empty(len(problems), 0, net.config.width, device=device), []
-    for step in range(longest):
-        x, reward, constraint, left = (
-            _column(values, device) for values in (state, returns, budget, time_to_go)
-        )
-        new = net.embed_descriptors(batch, x, reward, constraint, left, picture).flatten(1, 2)
-        tokens = torch.cat([tokens, new], dim=1)
-        modes, logits = net.decode_controls(net.transform(tokens, cache)[:, -1])
-        chosen = modes[torch.arange(len(modes)), (logits + noise[:, step]).argmax(1)]
-        control = (chosen * net.control_scale).double().cpu().numpy()
-        control = _within_limits(problems[0].scenario, state, control)
-        last = net.embed_controls(batch, _column(control, device), _column(time_to_go, device))
-        last = last.flatten(1, 2)
-        tokens = last if use_cache else torch.cat([tokens, last], dim=1)
-        returns = np.minimum(returns + np.abs(control).sum(axis=1), 0.0)
-        state = dynamics.step(state, control, dt, robot)
-        time_to_go = time_to_go - dt
-        controls.append(control)
-    table = np.stack(controls, axis=1)  # (B, longest N, 3)
-    return [row[: problem.n_steps] for row, problem in zip(table, problems)]
-
-
-def _mode_noise(draws: Sequence[int], n_steps: int, n_modes: int) -> Tensor:
-    """``(B, n_steps, n_modes)`` added to logits, their largest is a sample; none for draw 0."""
-    noise = {
-        draw: np.random.default_rng(draw).gumbel(size=(n_steps, n_modes)) if draw else 0.0
-        for draw in set(draws)
-    }
-    rows = [np.broadcast_to(noise[draw], (n_steps, n_modes)) for draw in draws]
-    return torch.from_numpy(np.array(rows, dtype=np.float32))
-
-
-def _column(values: FloatArray, device: torch.device) -> Tensor:
-    """``(B, ...)`` numbers as a float32 sequence of one step, ``(B, 1, ...)``."""
-    return torch.as_tensor(values[:, None], dtype=torch.float32, device=device)
-
-
-def _within_limits(scenario: Scenario, state: FloatArray, control: FloatArray) -> FloatArray:
-    """Controls ``(B, 3)`` scaled down to the actuation limit at the states ``(B, 6)``."""
-    clusters = scenario.robot.cluster_delta_v(state[:, 2], control)
-    share = np.abs(clusters).max(axis=1) / scenario.robot.delta_v_max(scenario.dt)
-    return control / np.maximum(share, 1.0)[:, None]

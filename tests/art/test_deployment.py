@@ -6,6 +6,7 @@ import torch
 
 from art_policy import ART, ARTConfig
 from art_policy.deployment import OnnxART, export_onnx
+from art_policy.generation import generate
 from art_policy.model import load_model
 from art_policy.planner import WarmStartPlanner
 from art_policy.rollout import propose_batch
@@ -67,11 +68,33 @@ def test_eight_bits_are_near_enough(exported, tmp_path):
         assert np.sqrt((gap**2).sum(axis=1).mean()) < 0.02
 
 
+@pytest.mark.parametrize(
+    "config",
+    [
+        ARTConfig.small(width=32, n_heads=2, n_layers=2, n_modes=3),
+        # Longer sequences than the context.
+        ARTConfig.small(width=32, n_heads=2, n_layers=2, context_length=20),
+        ARTConfig.paper(width=32, n_heads=2, n_layers=2),
+    ],
+    ids=["modes", "short context", "four tokens"],
+)
+def test_autoregressive_models_generate_the_same(config, tmp_path):
+    torch.manual_seed(1)
+    model = ART(config).eval()
+    other = load_model(export_onnx(model, tmp_path / "m.onnx"))
+    some = problems(2, 3)  # of 80 and 120 steps
+    returns, draws = np.array([-0.2, -0.3]), [0, 1]
+    ours, theirs = (generate(m, some, returns, draws=draws) for m in (model, other))
+    for one, two in zip(ours, theirs):
+        assert np.abs(one).max() > 1e-4
+        np.testing.assert_allclose(one, two, atol=1e-6)
+
+
 def test_what_cannot_be_exported_or_loaded(tmp_path):
     import onnx
 
-    with pytest.raises(ValueError, match="Only multi-hypothesis models"):
-        export_onnx(ART(ARTConfig.small(width=32, n_heads=1, n_layers=1)), tmp_path / "m.onnx")
+    with pytest.raises(ValueError, match="Only models that know the discs"):
+        export_onnx(ART(ARTConfig(width=32, n_heads=1, modalities=("image",))), tmp_path / "m.onnx")
     with pytest.raises(FileNotFoundError, match="There is no file"):
         load_model(tmp_path / "none.onnx")
     ends = [onnx.helper.make_tensor_value_info(name, 1, [1]) for name in "xy"]

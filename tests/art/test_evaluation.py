@@ -46,7 +46,7 @@ def test_figures_follow_the_protocol():
     groups = report(records, "model")["groups"]
     assert groups["C_REL >= 10"]["ART"]["n"] == 1
     assert "C_REL >= 15" not in groups
-    assert groups["4 obstacles, T_f = 40 s"] == groups["all"]
+    assert groups["4 obstacles, T_f = 40 s"]["ART"] == groups["all"]["ART"]
 
 
 def test_intervals_are_of_a_paired_bootstrap():

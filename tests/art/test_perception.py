@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 import torch
 
+from art_policy.generation import generate
 from art_policy.layers import MODALITIES, ARTConfig
 from art_policy.model import ART
 from art_policy.perception import IMAGE_SIZE, N_RAYS, as_pictures, pictures, scans
-from art_policy.rollout import generate, propose
+from art_policy.rollout import propose
 from art_policy.sequence import ProblemBatch
 from art_policy.training_data import HypothesisSet, SequenceSet
 from freeflyer_datasets.loading import PackedDataset

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 import torch
 
+from art_policy.generation import generate
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
-from art_policy.rollout import decode_poses, generate, propose, propose_batch
+from art_policy.rollout import decode_poses, propose, propose_batch
 from freeflyer_env import Obstacles, Problem, Scenario, dynamics, sample_problem
 from freeflyer_env.constraints import actuation_excess, keep_out_depth
 from freeflyer_env.planning import solve_rel, solve_scp
