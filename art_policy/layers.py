@@ -18,6 +18,7 @@ SCENE_DESCRIPTORS = ("relative", "absolute")
 DESCRIPTORS = ("goal", "reward_to_go", "constraint_to_go", "time_to_go")
 CONSTRAINT_TO_GO = ("decremented", "constant")
 MODALITIES = ("vector", "image", "lidar")
+KNOT_SPACINGS = ("uniform", "ends")
 
 
 @dataclass(frozen=True)
@@ -36,6 +37,8 @@ class ARTConfig:
         table: Size of the table in m, for which the positions are scaled.
         n_hypotheses: Multi-hypothesis only: number of proposals.
         n_knots: Multi-hypothesis only: number of interior knots of a proposal.
+        knot_spacing: Multi-hypothesis only: ``"uniform"``, or closer together at the ``"ends"``,
+            where the robot accelerates and brakes; which says an optimum twice as exactly.
         context_length: Autoregressive only: the paper's ``K``, in time steps.
         tokens_per_step: Autoregressive only: 4 as in the paper (state, performance, scene,
             control), or 2 (the three descriptors summed into one token, control).
@@ -62,7 +65,8 @@ class ARTConfig:
     dropout: float = 0.0
     table: tuple[float, float] = (3.5, 2.5)
     n_hypotheses: int = 6
-    n_knots: int = 20
+    n_knots: int = 40
+    knot_spacing: str = "ends"
     context_length: int = 100
     tokens_per_step: int = 4
     scene_descriptors: str = "relative"
@@ -78,6 +82,7 @@ class ARTConfig:
         self._require_choice("scene_descriptors", SCENE_DESCRIPTORS)
         self._require_choice("tokens_per_step", (2, 4))
         self._require_choice("constraint_to_go", CONSTRAINT_TO_GO)
+        self._require_choice("knot_spacing", KNOT_SPACINGS)
         for name, known in (("descriptors", DESCRIPTORS), ("modalities", MODALITIES)):
             object.__setattr__(self, name, tuple(getattr(self, name)))
             if unknown := set(getattr(self, name)) - set(known):
@@ -136,7 +141,9 @@ class ARTConfig:
                 "it was saved by a newer version."
             )
         envelope = data.get("envelope")
-        return cls(**{**data, "envelope": envelope and Envelope.from_dict(envelope)})
+        envelope = envelope and Envelope.from_dict(envelope)
+        # Models were saved without the spacing when there was but one.
+        return cls(**{"knot_spacing": "uniform", **data, "envelope": envelope})
 
 
 @dataclass

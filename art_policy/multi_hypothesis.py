@@ -7,8 +7,9 @@ straight line::
 
     q(s) = (1 - s) q_start + s q_goal + sum_k phi_k(s) d_k,      s = t / t_last,  q = (x, y, psi)
 
-with hat functions ``phi_k`` at equally spaced knots, so that the ends are exact and any number of
-nodes can be read off. There is no order among obstacles, and no limit to their number.
+with hat functions ``phi_k`` at knots that lie closest where the robot accelerates and brakes. The
+ends are exact, and any number of nodes can be read off. There is no order among obstacles, and no
+limit to their number.
 """
 
 from __future__ import annotations
@@ -35,11 +36,31 @@ _DECOY_MARGIN = 0.02  # m: paths are compared at few times, and may dip between 
 
 
 @lru_cache(maxsize=64)
-def interpolation_matrix(n_knots: int, n_nodes: int) -> Tensor:
+def interpolation_matrix(n_knots: int, n_nodes: int, spacing: str = "ends") -> Tensor:
     """``(n_nodes, n_knots)`` values of the hat functions at equally spaced nodes."""
-    position = torch.linspace(0.0, n_knots + 1.0, n_nodes)
-    distance = (position[:, None] - torch.arange(1.0, n_knots + 1.0)).abs()
-    return (1.0 - distance).clamp(min=0.0)
+    return hats(n_knots, torch.linspace(0.0, 1.0, n_nodes, dtype=torch.float64), spacing).float()
+
+
+def hats(n_knots: int, places: Tensor, spacing: str) -> Tensor:
+    """Values of the hat functions ``(S, n_knots)`` at ``places`` ``(S,)`` between 0 and 1."""
+    knots = knot_places(n_knots, spacing)
+    left, here, right = knots[:-2], knots[1:-1], knots[2:]
+    rise, fall = (
+        (places[:, None] - left) / (here - left),
+        (right - places[:, None]) / (right - here),
+    )
+    return torch.minimum(rise, fall).clamp(min=0.0)
+
+
+def knot_places(n_knots: int, spacing: str) -> Tensor:
+    """``(n_knots + 2,)`` places of the knots from 0 to 1, both ends included.
+
+    Those closer at the ends lie half-way between uniform knots and Chebyshev's.
+    """
+    uniform = torch.linspace(0.0, 1.0, n_knots + 2, dtype=torch.float64)
+    if spacing == "uniform":
+        return uniform
+    return 0.5 * uniform + 0.25 * (1.0 - (math.pi * uniform).cos())
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,7 +209,8 @@ class MultiHypothesis(nn.Module):
             the ``regret``, the relative excess cost of the optimum nearest to the best-scored one.
         """
         knots, scores = self(batch.problems)
-        matrix = interpolation_matrix(self.config.n_knots, batch.paths.shape[2]).to(knots.device)
+        n_knots, spacing = self.config.n_knots, self.config.knot_spacing
+        matrix = interpolation_matrix(n_knots, batch.paths.shape[2], spacing).to(knots.device)
         with torch.autocast(knots.device.type, enabled=False):
             paths = torch.einsum("sk,bhkc->bhsc", matrix, knots)  # (B, H, S, 3)
             distances = _distances(paths, batch.paths, weights.heading_weight)  # (B, R, H)

@@ -93,23 +93,26 @@ def _hypotheses(
     return [
         [
             Proposal(Trajectory.from_poses(problem, poses), score)
-            for poses, score in zip(decode_poses(problem, deviation.numpy()), values)
+            for poses, score in zip(
+                decode_poses(problem, deviation.numpy(), config.knot_spacing), values
+            )
         ]
         for problem, deviation, values in zip(problems, knots, scores.tolist())
     ]
 
 
-def decode_poses(problem: Problem, knots: FloatArray) -> FloatArray:
+def decode_poses(problem: Problem, knots: FloatArray, spacing: str = "ends") -> FloatArray:
     """Poses at the nodes from deviations at the knots, on the table and out of the keep-out discs.
 
     Args:
         problem: Gives the ends, the number of nodes and the scene.
         knots: ``(H, n_knots, 3)`` deviations from the straight line in m, m, rad.
+        spacing: Of the knots, as in :class:`ARTConfig`.
 
     Returns:
         ``(H, N, 3)`` poses ``(r_x, r_y, psi)``; the ends are the problem's.
     """
-    matrix = interpolation_matrix(knots.shape[1], problem.n_steps).numpy()
+    matrix = interpolation_matrix(knots.shape[1], problem.n_steps, spacing).numpy()
     share = np.linspace(0.0, 1.0, problem.n_steps)[:, None]
     line = (1.0 - share) * problem.start[:3] + share * problem.goal[:3]
     poses = line + matrix @ knots.astype(np.float64)  # (N, 3) + (H, N, 3)

@@ -28,6 +28,7 @@ from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.model_card import write_card
+from art_policy.multi_hypothesis import MultiHypothesis, hats, knot_places
 from art_policy.throughput import flops_per_example
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import Interrupt, Log
@@ -329,19 +330,31 @@ def _examples(
 
 
 def _initialise(model: ART, name: str) -> None:
-    """Begins with the weights of another model; another number of hypotheses begins anew."""
+    """Begins with the weights of another model.
+
+    More hypotheses than it has begin anew; other knots begin where its own put them.
+    """
     other = ART.from_pretrained(name)
     ours, theirs = model.config.to_dict(), other.config.to_dict()
     changed = [key for key in ours if ours[key] != theirs[key]]
-    if changed := sorted(set(changed) - {"n_hypotheses", "dropout", "envelope"}):
+    free = {"n_hypotheses", "n_knots", "knot_spacing", "dropout", "envelope"}
+    if changed := sorted(set(changed) - free):
         raise ValueError(
             f"TrainConfig.init: {name!r} is of another {', '.join(changed)} than the model that is "
             "to be trained."
         )
     weights = other.state_dict()
-    if ours["n_hypotheses"] != theirs["n_hypotheses"]:
-        del weights["net.query_embedding"]
-    model.load_state_dict(weights, strict=False)
+    if isinstance(model.net, MultiHypothesis):
+        queries = model.net.query_embedding.detach().clone()
+        both = min(len(queries), other.config.n_hypotheses)
+        queries[:both] = weights["net.query_embedding"][:both]
+        weights["net.query_embedding"] = queries
+        places = knot_places(model.config.n_knots, model.config.knot_spacing)[1:-1]
+        values = hats(other.config.n_knots, places, other.config.knot_spacing).float()
+        for name in ("net.knot_decoder.linear.weight", "net.knot_decoder.linear.bias"):
+            by_knot = weights[name].unflatten(0, (-1, 3))  # (n_knots, 3, ...)
+            weights[name] = torch.einsum("ij,j...->i...", values, by_knot).flatten(0, 1)
+    model.load_state_dict(weights)
 
 
 def _batch_size(training: ExampleSet, config: TrainConfig) -> int:

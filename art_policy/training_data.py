@@ -54,7 +54,7 @@ class HypothesisSet:
         table: tuple[float, float],
         tails: float = 0.0,
         max_discs: int | None = None,
-        n_samples: int = 64,
+        n_samples: int = 128,
         max_optima: int = 4,
     ) -> None:
         label, rank = np.asarray(dataset.label), np.asarray(dataset.rank)

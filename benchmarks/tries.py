@@ -42,15 +42,15 @@ from freeflyer_datasets import PackedDataset
 
 #: Name, problems, changes of the model, changes of the loss, changes of the training.
 VARIANTS: list[tuple[str, int, dict[str, Any], dict[str, Any], dict[str, Any]]] = [
-    ("base: 30,000 problems, 6 hypotheses, 20 knots, width 192", 30_000, {}, {}, {}),
+    ("base: 30,000 problems, 6 hypotheses, 40 knots, width 192", 30_000, {}, {}, {}),
     ("3,000 problems", 3_000, {}, {}, {}),
     ("10,000 problems", 10_000, {}, {}, {}),
     ("100,000 problems", 100_000, {}, {}, {}),
     ("1 hypothesis", 30_000, {"n_hypotheses": 1}, {}, {}),
     ("3 hypotheses", 30_000, {"n_hypotheses": 3}, {}, {}),
     ("12 hypotheses", 30_000, {"n_hypotheses": 12}, {}, {}),
-    ("10 knots", 30_000, {"n_knots": 10}, {}, {}),
-    ("40 knots", 30_000, {"n_knots": 40}, {}, {}),
+    ("20 knots", 30_000, {"n_knots": 20}, {}, {}),
+    ("20 knots, equally spaced", 30_000, {"n_knots": 20, "knot_spacing": "uniform"}, {}, {}),
     ("width 96", 30_000, {"width": 96}, {}, {}),
     ("width 288", 30_000, {"width": 288}, {}, {}),
     ("the cheapest optimum alone as label", 30_000, {}, {"others_weight": 0.0}, {}),

@@ -10,9 +10,14 @@ import numpy as np
 import pytest
 import torch
 
-from art_policy.layers import ARTConfig, KeyValueCache
+from art_policy.layers import KNOT_SPACINGS, ARTConfig, KeyValueCache
 from art_policy.model import ART, CONFIG_NAME, WEIGHTS_NAME
-from art_policy.multi_hypothesis import HypothesisLoss, _assign, interpolation_matrix
+from art_policy.multi_hypothesis import (
+    HypothesisLoss,
+    _assign,
+    interpolation_matrix,
+    knot_places,
+)
 from art_policy.sequence import ProblemBatch, SequenceBatch
 from art_policy.training_data import HypothesisSet, SequenceSet, problem_batch
 from freeflyer_datasets.loading import PackedDataset
@@ -140,12 +145,21 @@ def test_no_obstacles_at_all(dataset: PackedDataset) -> None:
     assert scores.isfinite().all()
 
 
-def test_interpolation_is_exact_for_piecewise_linear_paths_and_pins_the_ends() -> None:
-    matrix = interpolation_matrix(20, 85)
+@pytest.mark.parametrize("spacing", KNOT_SPACINGS)
+def test_interpolation_is_exact_for_piecewise_linear_paths_and_pins_the_ends(spacing: str) -> None:
+    matrix = interpolation_matrix(20, 85, spacing)
     assert matrix[[0, -1]].abs().max() == 0.0
-    knots = torch.arange(1.0, 21.0)  # a ramp whose far end is pinned to zero
-    values = matrix @ knots
-    torch.testing.assert_close(values[:81], torch.linspace(0.0, 21.0, 85)[:81])
+    places = knot_places(20, spacing)
+    torch.testing.assert_close(places, 1.0 - places.flip(0))
+    values = matrix @ places[1:-1].float()  # a ramp whose far end is pinned to zero
+    before = torch.linspace(0.0, 1.0, 85) <= places[-2]
+    torch.testing.assert_close(values[before], torch.linspace(0.0, 1.0, 85)[before])
+
+
+def test_knots_lie_closest_at_the_ends() -> None:
+    gaps = knot_places(40, "ends").diff()
+    assert gaps[20] > 2.0 * gaps[0] > 0.0
+    torch.testing.assert_close(knot_places(3, "uniform"), torch.linspace(0, 1, 5).double())
 
 
 def test_assignment_gives_no_hypothesis_twice_and_serves_the_cheapest_first() -> None:

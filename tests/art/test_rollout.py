@@ -89,7 +89,7 @@ def test_decoded_poses_follow_the_knots_where_nothing_is_in_the_way() -> None:
     start, goal = np.array([0.2, 1.0, 0.0, 0, 0, 0]), np.array([3.2, 1.0, 1.0, 0, 0, 0])
     problem = Problem(empty, start, goal, 11.0)  # 22 nodes: 20 interior knots fall on nodes
     knots = np.random.default_rng(0).normal(size=(2, 20, 3)) * 0.1
-    poses = decode_poses(problem, knots)
+    poses = decode_poses(problem, knots, "uniform")
     share = np.linspace(0.0, 1.0, 22)[1:-1, None]
     line = (1.0 - share) * start[:3] + share * goal[:3]
     np.testing.assert_allclose(poses[:, 1:-1], line + knots, atol=1e-6)

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -19,9 +20,10 @@ from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.sequence import DISC_SPEED
-from art_policy.train import CHECKPOINT_NAME, train
+from art_policy.train import CHECKPOINT_NAME, _initialise, train
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import LOG_NAME
+from art_policy.training_data import problem_batch
 from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
@@ -110,6 +112,26 @@ def test_a_model_knows_what_it_was_trained_on(dataset: PackedDataset, tmp_path: 
     assert envelope is not None
     assert envelope.n_obstacles == (2, 6)
     assert envelope.obstacle_speed == DISC_SPEED
+
+
+def test_other_knots_and_more_hypotheses_begin_with_the_same_paths(
+    dataset: PackedDataset, tmp_path: Path
+) -> None:
+    torch.manual_seed(1)
+    first = replace(TINY, n_knots=6, knot_spacing="uniform")
+    model = ART(first).eval()
+    model.save_pretrained(tmp_path)
+    finer = ART(replace(first, n_knots=13)).eval()  # every second knot is where one was
+    _initialise(finer, str(tmp_path))
+    problems = problem_batch(dataset, np.arange(3))
+    with torch.inference_mode():
+        (paths, scores), (fine_paths, fine_scores) = model(problems), finer(problems)
+    torch.testing.assert_close(fine_paths[:, :, 1::2], paths)
+    torch.testing.assert_close(fine_scores, scores)
+    more = ART(replace(first, n_hypotheses=6)).eval()
+    _initialise(more, str(tmp_path))
+    ours, theirs = (dict(each.named_parameters())["net.query_embedding"] for each in (more, model))
+    torch.testing.assert_close(ours[:4], theirs, atol=0.0, rtol=0.0)
 
 
 def test_validation_problems_are_never_trained_on(dataset: PackedDataset) -> None:
