@@ -32,6 +32,7 @@ _RATE_SCALE = (10.0, 10.0, 5.0)  # s/m, s/m, s/rad
 _SHORTEST = 5.0  # s: shorter final times are described as this one
 _POSE_SCALE = (0.25, 0.25, 0.5)  # m, m, rad: size of a typical deviation
 _ROBOT_RADIUS = 0.15  # m: half the width of the gap that lets the robot pass
+_PART = 128  # problems of similar size that are trained on together
 _DECOY_MARGIN = 0.02  # m: paths are compared at few times, and may dip between them
 
 
@@ -198,6 +199,14 @@ class MultiHypothesis(nn.Module):
         knots = self.knot_decoder(x).view(batch, n_queries, self.config.n_knots, 3)
         return knots * knots.new_tensor(_POSE_SCALE), self.score_decoder(x).squeeze(-1)
 
+    def _in_parts(self, problems: ProblemBatch) -> tuple[Tensor, Tensor]:
+        """As :meth:`forward`; on a CPU without the work that padding makes."""
+        if problems.start.device.type != "cpu" or bool(problems.present.all()):
+            return self(problems)
+        parts, places = problems.by_number_of_discs(_PART)
+        knots, scores = zip(*(self(part) for part in parts))
+        return torch.cat(knots)[places], torch.cat(scores)[places]
+
     def loss(
         self, batch: HypothesisBatch, weights: HypothesisLoss = HypothesisLoss()
     ) -> tuple[Tensor, dict[str, Tensor]]:
@@ -208,7 +217,7 @@ class MultiHypothesis(nn.Module):
             ``chosen_distance`` of the best-scored hypothesis in m, ``agreement`` of the two, and
             the ``regret``, the relative excess cost of the optimum nearest to the best-scored one.
         """
-        knots, scores = self(batch.problems)
+        knots, scores = self._in_parts(batch.problems)
         n_knots, spacing = self.config.n_knots, self.config.knot_spacing
         matrix = interpolation_matrix(n_knots, batch.paths.shape[2], spacing).to(knots.device)
         with torch.autocast(knots.device.type, enabled=False):

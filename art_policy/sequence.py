@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -91,6 +91,22 @@ class ProblemBatch:
 
     def __getitem__(self, index: Tensor) -> ProblemBatch:
         return ProblemBatch(*(getattr(self, item.name)[index] for item in fields(self)))
+
+    def by_number_of_discs(self, size: int) -> tuple[list[ProblemBatch], Tensor]:
+        """Parts of at most ``size`` problems with about as many discs, hardly padded.
+
+        Returns:
+            The parts, fewest discs first, and the places ``(B,)`` of the problems among them: row
+            ``i`` of this batch is row ``places[i]`` of the parts one after the other.
+        """
+        present = self.present
+        counts, first = present.sum(1), (~present).byte().argsort(dim=1, stable=True)
+        discs = self.discs.gather(1, first[..., None].expand_as(self.discs))
+        order, parts = counts.argsort(stable=True), []
+        for index in order.split(size):
+            part = replace(self[index], discs=discs[index, : int(counts[index].max())])
+            parts.append(part)
+        return parts, order.argsort()
 
     def discs_at(self, times: Tensor) -> Tensor:
         """Rows ``(B, L, M, 3)``, ``(x, y, keep-out radius)``, at times ``(B, L)`` in s."""

@@ -145,6 +145,19 @@ def test_no_obstacles_at_all(dataset: PackedDataset) -> None:
     assert scores.isfinite().all()
 
 
+def test_training_in_parts_of_similar_size_changes_nothing(dataset: PackedDataset) -> None:
+    batch, model = problems(dataset), make(TINY)
+    assert not batch.present.all()
+    batch = replace(batch, discs=batch.discs.flip(1))  # padding first
+    parts, places = batch.by_number_of_discs(5)
+    counts = [part.present.sum(1) for part in parts]
+    assert [len(part) for part in parts] == [5, 5, 2]
+    assert all(part.discs.shape[1] == count.max() for part, count in zip(parts, counts))
+    assert torch.equal(torch.cat(counts)[places], batch.present.sum(1))
+    for ours, theirs in zip(model.net._in_parts(batch), model(batch)):
+        torch.testing.assert_close(ours, theirs)
+
+
 @pytest.mark.parametrize("spacing", KNOT_SPACINGS)
 def test_interpolation_is_exact_for_piecewise_linear_paths_and_pins_the_ends(spacing: str) -> None:
     matrix = interpolation_matrix(20, 85, spacing)
