@@ -275,8 +275,8 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", help="JSON file for the report; with it the evaluation resumes")
     sub.add_argument("--figures", help="folder for figures")
 
-    sub = command("export", export_model, "Write a model as ONNX, to run without PyTorch.")
-    sub.add_argument("model", help="a multi-hypothesis model")
+    sub = command("export", export_model, "Write a model as ONNX, quicker for one problem.")
+    sub.add_argument("model", help="a shipped model's name, folder, Hugging Face id")
     sub.add_argument("--int8", action="store_true", help="weights as 8-bit integers")
     sub.add_argument("--out", required=True, help=".onnx file")
 

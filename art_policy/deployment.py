@@ -1,4 +1,4 @@
-"""A model without PyTorch: export to ONNX, and running what was exported.
+"""A model without PyTorch's layers: export to ONNX, and running what was exported.
 
 ONNX Runtime is small, runs on what on-board computers have, and on one processor core is faster
 than PyTorch for a single problem.
@@ -201,7 +201,6 @@ class OnnxART:
         ModuleNotFoundError: Without ``onnxruntime``.
     """
 
-    net = None
     device = torch.device("cpu")
 
     def __init__(self, path: str | Path, threads: int = 1) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -83,6 +84,7 @@ def one_obstacle_moves(
     """
     from matplotlib.figure import Figure
 
+    colors = ("#1f6fb4", "#ec7a1c", "#2c9660", "#9467bd")
     scene = Scenario.named("held-out-1")
     start, goal = np.zeros(6), np.zeros(6)
     start[:2], goal[:2] = (0.25, 1.25), (3.25, 1.25)
@@ -96,7 +98,7 @@ def one_obstacle_moves(
         rel = solve_rel(problem).trajectory
         if rel is not None:
             axis.plot(*rel.states[:, :2].T, color="0.6", lw=1.0, ls=":", label="REL")
-        for (name, model), color in zip(models.items(), ("#1f6fb4", "#ec7a1c", "#2c9660")):
+        for (name, model), color in zip(models.items(), itertools.cycle(colors)):
             warm_start = propose(model, problem, rel=rel)[0].trajectory
             axis.plot(*warm_start.states[:, :2].T, "--", color=color, lw=1.0, label=name)
             refined = solve_scp(problem, warm_start)

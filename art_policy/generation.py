@@ -11,7 +11,7 @@ from torch import Tensor
 
 from art_policy.autoregressive import Autoregressive
 from art_policy.layers import ARTConfig, KeyValueCache
-from art_policy.sequence import ProblemBatch
+from art_policy.sequence import MIRROR_CONTROL, MIRROR_STATE, ProblemBatch
 from freeflyer_env import dynamics
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem, Scenario
@@ -110,14 +110,19 @@ def generate(
     dt, robot = problems[0].scenario.dt, problems[0].scenario.robot
     if any((p.scenario.dt, p.scenario.robot) != (dt, robot) for p in problems):
         raise ValueError("Problems that are generated together must share the robot and the step.")
+    # In training the goal is to the right; other problems are looked at in a mirror.
+    to_left = np.array([problem.goal[0] < problem.start[0] for problem in problems])
+    width = net.config.table[0]
+    seen = ProblemBatch.from_problems(problems).mirrored(torch.from_numpy(to_left), width, axis=0)
     state = np.array([problem.start for problem in problems])
+    state[to_left] = state[to_left] * MIRROR_STATE[0] + (width, 0.0, 0.0, 0.0, 0.0, 0.0)
     time_to_go = np.array([problem.final_time for problem in problems])
     returns = np.array(returns_to_go, dtype=np.float64)
     # No violation is asked for. Nor is a budget overdrawn after one: no example ever showed that.
     budget = np.zeros(len(problems))
     longest, rows = max(problem.n_steps for problem in problems), np.arange(len(problems))
     noise = _mode_noise(draws or [0] * len(problems), longest, net.config.n_modes)
-    steps, controls = net.steps(ProblemBatch.from_problems(problems), use_cache), []
+    steps, controls = net.steps(seen, use_cache), []
     for step in range(longest):
         modes, logits = steps.predict(state, returns, budget, time_to_go)
         control = modes[rows, (logits + noise[:, step]).argmax(axis=1)]
@@ -128,6 +133,7 @@ def generate(
         time_to_go = time_to_go - dt
         controls.append(control)
     table = np.stack(controls, axis=1)  # (B, longest N, 3)
+    table[to_left] *= MIRROR_CONTROL[0]
     return [row[: problem.n_steps] for row, problem in zip(table, problems)]
 
 

@@ -7,10 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from art_policy.throughput import peak_flops
-
 _FIGURES = {
     "val_loss": "loss",
     "val_distance": "nearest hypothesis, distance to the cheapest optimum in m",
@@ -26,7 +22,11 @@ _FIGURES = {
 
 
 def write_card(
-    folder: Path, settings: dict[str, Any], log: Sequence[dict[str, Any]], flops: float
+    folder: Path,
+    settings: dict[str, Any],
+    log: Sequence[dict[str, Any]],
+    flops: float,
+    peak: float,
 ) -> Path:
     """Writes ``README.md`` into a model's folder.
 
@@ -35,6 +35,7 @@ def write_card(
         settings: Of the run: ``model``, ``train`` and ``data``.
         log: All rows of the log.
         flops: Operations of matrix products per example, forward and backward.
+        peak: Operations a second that large matrix products reach on all devices of the run.
     """
     model, train, data = settings["model"], settings["train"], settings["data"]
     steps = [row for row in log if "lr" in row]
@@ -53,7 +54,9 @@ def write_card(
         lines += [
             f"| steps | {steps[-1]['step']:,} of {train['batch_size']} examples |",
             f"| time | {steps[-1]['minutes']:.0f} minutes |",
-            f"| throughput | {speed:,.0f} examples/s, {_utilisation(speed * flops)} |",
+            f"| throughput | {speed:,.0f} examples/s, {speed * flops / 1e12:.3g} TFLOP/s of "
+            f"matrix products, {speed * flops / peak:.0%} of the {peak / 1e12:.3g} that large ones "
+            "reach |",
         ]
     if envelope := model.get("envelope"):
         low, high = envelope["final_time"]
@@ -62,22 +65,14 @@ def write_card(
             f"| final times | {low:g} to {high:g} s |",
             f"| obstacles | {fewest} to {most}, up to {envelope['obstacle_speed']:g} m/s |",
         ]
-    for last in [row for row in log if any(key in row for key in _FIGURES)][-1:]:
+    examined = [row for row in log if any(key in row for key in _FIGURES)]
+    if examined:
+        # The model that is kept: the one that planned best, the later one of two alike.
+        kept = min(reversed(examined), key=lambda row: row.get("val_excess", 0.0))
         lines += ["", "## On held-out problems", "", "| figure | value |", "|---|---|"]
-        lines += [f"| {text} | {last[k]:.4g} |" for k, text in _FIGURES.items() if k in last]
+        lines += [f"| step | {kept['step']:,} |"]
+        lines += [f"| {text} | {kept[k]:.4g} |" for k, text in _FIGURES.items() if k in kept]
     lines += ["", "## Settings", "", "```json", json.dumps(settings, indent=1), "```", ""]
     path = folder / "README.md"
     path.write_text("\n".join(lines), encoding="utf-8")
     return path
-
-
-def _utilisation(work: float) -> str:
-    """Operations a second, as a share of what a matrix product reaches on this machine."""
-    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    half = device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
-    peak = peak_flops(device, torch.bfloat16 if half else torch.float32)
-    kind = "bfloat16" if half else "float32"
-    return (
-        f"{work / 1e12:.3g} TFLOP/s of matrix products, {work / peak:.0%} of the {peak / 1e12:.3g} "
-        f"that a large one reaches here in {kind}"
-    )

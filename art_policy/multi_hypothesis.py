@@ -102,9 +102,11 @@ class HypothesisBatch:
         return HypothesisBatch(problems, paths, self.costs)
 
     def with_decoys(
-        self, table: tuple[float, float], dt: float, generator: torch.Generator
+        self, table: tuple[float, float], dt: float, most: int, generator: torch.Generator
     ) -> HypothesisBatch:
         """Each example with more discs, at rest or moving, in a random share of its free rows.
+
+        Scenes with ``most`` discs or more are left alone, others get no more than that.
 
         No disc comes near the cheapest optimum, which therefore stays what it is: more constraints
         make nothing cheaper. Other optima that the discs do touch are dropped.
@@ -121,7 +123,9 @@ class HypothesisBatch:
         wanted = torch.rand(discs.shape[:2], generator=generator) < torch.rand(
             len(discs), 1, generator=generator
         )
-        placed = wanted & ~near[:, 0] & ~self.problems.present  # (B, M)
+        present = self.problems.present
+        placed = wanted & ~near[:, 0] & ~present  # (B, M)
+        placed &= placed.cumsum(1) + present.sum(1, keepdim=True) <= most
         lost = (near & placed[:, None]).any(2)  # never the cheapest
         problems = replace(self.problems, discs=torch.where(placed[..., None], added, discs))
         return HypothesisBatch(problems, self.paths, self.costs.masked_fill(lost, math.inf))

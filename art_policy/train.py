@@ -29,7 +29,7 @@ from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.model_card import write_card
 from art_policy.multi_hypothesis import MultiHypothesis, hats, knot_places
-from art_policy.throughput import flops_per_example
+from art_policy.throughput import flops_per_example, peak_flops
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import Interrupt, Log
 from art_policy.training_data import HypothesisSet, SequenceSet
@@ -135,9 +135,10 @@ class _State:
         self.step, self.seconds = content["step"], content["seconds"]
         self.best = content.get("best", math.inf)
 
-    def advance(self, batch: Any, config: TrainConfig) -> dict[str, float | Tensor]:
+    def advance(self, batches: Iterator[Any], config: TrainConfig) -> dict[str, float | Tensor]:
         """One optimiser step; returns figures to log."""
         began = time.perf_counter()
+        batch = next(batches)
         rate = config.rate(config.progress(self.step, self.seconds))
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -173,8 +174,8 @@ class _State:
 
 #: Settings in which a resumed run may differ from the one that wrote the checkpoint.
 _MAY_CHANGE = frozenset(
-    {"threads", "log_every", "validate_every", "solve_problems", "checkpoint_minutes",
-     "compile", "device", "max_minutes", "max_steps"}
+    {"threads", "log_every", "validate_every", "checkpoint_minutes", "compile", "device",
+     "max_minutes", "max_steps"}
 )  # fmt: skip
 
 
@@ -200,8 +201,9 @@ def train(
             ``tensorboard``, ``checkpoint.pt``, and ``best``, the model that planned best so far.
 
     Returns:
-        The model with averaged weights that planned best, in evaluation mode. After Ctrl-C too:
-        everything is saved.
+        The model with averaged weights that planned best, in evaluation mode; of several processes
+        the first one knows it, the others return the last one. After Ctrl-C too: everything is
+        saved.
 
     Raises:
         ValueError: If a checkpoint in ``out`` is of a different run, or there is nothing to train
@@ -224,8 +226,11 @@ def train(
     names = " + ".join(each.dataset_id for each in datasets)
     source = {"dataset": names, "examples": len(training)}
     state = _State.create(model_config, config, source, accelerator)
-    if isinstance(state.model.net, Autoregressive) and isinstance(training, SequenceSet):
-        sample = training.batch(torch.arange(min(len(training), 2048)), torch.Generator())
+    # Weights that training begins with bring the scales that they were trained with.
+    if config.init is None and isinstance(training, SequenceSet):
+        assert isinstance(state.model.net, Autoregressive)
+        spread = torch.linspace(0, len(training) - 1, min(len(training), 2048)).long()
+        sample = training.batch(spread, torch.Generator())
         state.model.net.fit_scales(sample.to(accelerator.device))
     checkpoint = out / CHECKPOINT_NAME
     if resume and checkpoint.exists():
@@ -246,7 +251,10 @@ def train(
         if (out / BEST_NAME).is_dir():
             model = ART.from_pretrained(out / BEST_NAME, str(accelerator.device))
         model.save_pretrained(out)
-        write_card(out, state.settings, log.rows(), flops_per_example(state.model, training))
+        dtype = torch.bfloat16 if _is_half(config, accelerator.device) else torch.float32
+        peak = accelerator.num_processes * peak_flops(accelerator.device, dtype)
+        flops = flops_per_example(state.model, training)
+        write_card(out, state.settings, log.rows(), flops, peak)
         log.close()
     accelerator.wait_for_everyone()
     return model
@@ -268,8 +276,10 @@ def _loop(
     layout = "{percentage:3.0f}% |{bar}| {elapsed}<{remaining}"
     bar = tqdm(total=100, desc="training", leave=False, bar_format=layout, disable=log is None)
     with Interrupt() as interrupt, bar:
-        while (progress := config.progress(state.step, state.seconds)) < 1.0 and not interrupt.seen:
-            figures = state.advance(next(batches), config)
+        while (progress := config.progress(state.step, state.seconds)) < 1.0:
+            if _anyone(interrupt.seen, state.accelerator):
+                break
+            figures = state.advance(batches, config)
             now = time.perf_counter()
             state.seconds = before + now - start
             bar.update(100.0 * progress - bar.n)
@@ -283,9 +293,17 @@ def _loop(
                 state.save(out / CHECKPOINT_NAME)
                 state.averaged_model().save_pretrained(out)
                 saved = now
-    if interrupt.seen:
+    finished = config.progress(state.step, state.seconds) >= 1.0
+    if not finished:
         logger.warning("Interrupted at step %d; saving.", state.step)
-    return not interrupt.seen
+    return finished
+
+
+def _anyone(flag: bool, accelerator: Accelerator) -> bool:
+    """Whether the flag is set in any process; all of them ask together."""
+    if accelerator.num_processes == 1:
+        return flag
+    return bool(accelerator.reduce(torch.tensor(float(flag), device=accelerator.device)) > 0.0)
 
 
 def _examine(
@@ -322,7 +340,7 @@ def _examples(
             for side in range(2)
         )
         return training, validation
-    tails, most = config.tails, config.max_discs
+    tails, most = config.tails, config.max_discs if config.augment else None
     return (
         HypothesisSet.joined([HypothesisSet(d, s[0], model.table, tails, most) for d, s in pairs]),
         HypothesisSet.joined([HypothesisSet(d, s[1], model.table) for d, s in pairs]),
@@ -405,8 +423,11 @@ def _validate(model: ART, validation: ExampleSet, config: TrainConfig) -> dict[s
 
 
 def _autocast(config: TrainConfig, device: torch.device) -> torch.autocast:
-    kind = device.type
-    enabled = config.precision == "bfloat16"
+    return torch.autocast(device.type, dtype=torch.bfloat16, enabled=_is_half(config, device))
+
+
+def _is_half(config: TrainConfig, device: torch.device) -> bool:
+    """Whether matrix products are in bfloat16."""
     if config.precision == "auto":
-        enabled = kind == "cuda" or torch.cpu._is_avx512_bf16_supported()
-    return torch.autocast(kind, dtype=torch.bfloat16, enabled=enabled)
+        return device.type == "cuda" or torch.cpu._is_avx512_bf16_supported()
+    return config.precision == "bfloat16"

@@ -25,8 +25,8 @@ class TrainConfig:
         augment: Whether examples are put under random symmetries of the problem.
         tails: Multi-hypothesis only: share of the problems of which one is added that begins in
             flight, for re-planning.
-        max_discs: Multi-hypothesis only: if given, augmentation adds up to so many discs to a scene
-            where they leave the best optimum what it is.
+        max_discs: Multi-hypothesis only: if given, augmentation adds discs to a scene, until it has
+            at most so many, where they leave the best optimum what it is.
         init: Model whose weights training begins with, as :meth:`ART.from_pretrained` takes it;
             None for random ones.
         validation_fraction: Share of the problems that are held out.
@@ -58,7 +58,7 @@ class TrainConfig:
     validation_fraction: float = 0.05
     log_every: int = 50
     validate_every: int = 500
-    solve_problems: int = 100
+    solve_problems: int = 300
     checkpoint_minutes: float = 3.0
     precision: str = "auto"
     threads: int | None = None
@@ -70,7 +70,7 @@ class TrainConfig:
         if self.max_steps is None and self.max_minutes is None:
             raise ValueError("TrainConfig needs max_steps or max_minutes (or both).")
         for name in ("max_steps", "max_minutes", "batch_size", "learning_rate", "gradient_clip",
-                     "log_every", "validate_every", "checkpoint_minutes"):  # fmt: skip
+                     "max_discs", "log_every", "validate_every", "checkpoint_minutes"):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"TrainConfig.{name} must be positive, got {value}.")

@@ -78,13 +78,15 @@ class HypothesisSet:
         if tails:
             batch = _joined([batch, _tails(dataset, chosen, tails, n_optima, n_samples)])
         self._examples, self._table, self._dt = batch, table, dataset.dt
-        self._decoys = max_discs is not None
+        self._max_discs = max_discs
         if max_discs is not None:
             self._examples = _padded(batch, max_discs, n_optima)
 
     @classmethod
     def joined(cls, sets: Sequence[HypothesisSet]) -> HypothesisSet:
         """The examples of several sets that were made with the same settings."""
+        if len(sets) == 1:
+            return sets[0]
         whole = copy.copy(sets[0])
         whole._examples = _joined([each._examples for each in sets])
         return whole
@@ -96,9 +98,10 @@ class HypothesisSet:
         if not len(problems):
             return None
         envelope = Envelope.of(problems)
-        if not self._decoys:
+        if self._max_discs is None:
             return envelope
-        counts = (envelope.n_obstacles[0], problems.discs.shape[1])
+        fewest, most = envelope.n_obstacles
+        counts = (fewest, max(most, self._max_discs))
         return replace(
             envelope, n_obstacles=counts, obstacle_speed=max(envelope.obstacle_speed, DISC_SPEED)
         )
@@ -113,7 +116,9 @@ class HypothesisSet:
         if generator is None:
             return examples
         examples = examples.augmented(self._table, self._dt, generator)
-        return examples.with_decoys(self._table, self._dt, generator) if self._decoys else examples
+        if self._max_discs is None:
+            return examples
+        return examples.with_decoys(self._table, self._dt, self._max_discs, generator)
 
 
 #: Fewest steps that are left of a trajectory in a problem that begins in flight.

@@ -89,11 +89,6 @@ class FlowMatching(nn.Module):
         self.register_buffer("noise", noise)
 
     @property
-    def net(self) -> FlowMatching:
-        """What :func:`.propose` looks at to tell the heads apart."""
-        return self
-
-    @property
     def device(self) -> torch.device:
         """Where the weights are."""
         return self.noise.device

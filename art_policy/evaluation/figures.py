@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,9 @@ _PANELS = (
     ("suboptimality_improvement", "suboptimality improvement in %"),
     ("mean_iterations", "iterations"),
 )
-_COLORS = ("#7f8794", "#b7bdc8", "#1f6fb4", "#7fb3dd", "#ec7a1c", "#f5b27c", "#2c9660", "#9467bd")
+#: Of the methods in their order; more than these begin again.
+_COLORS = ("#7f8794", "#b7bdc8", "#1f6fb4", "#7fb3dd", "#17507f", "#ec7a1c", "#f5b27c", "#a8530d",
+           "#2c9660", "#7cc9a2", "#9467bd", "#c7aede", "#8c564b", "#d62728")  # fmt: skip
 
 
 def figures(report: Mapping[str, Any], folder: Path) -> list[Path]:
@@ -59,7 +62,7 @@ def cost_against_time(group: Mapping[str, Mapping[str, Any]], path: Path) -> Pat
     """Suboptimality improvement against median time of every method, with infeasible rates."""
     figure = _figure(8.6, 3.8)
     axis = figure.subplots()
-    for (name, row), color in zip(_methods(group), _COLORS):
+    for (name, row), color in zip(_methods(group), itertools.cycle(_COLORS)):
         x, y = row["median_time_ms"], 100.0 * row["suboptimality_improvement"]
         ends = row.get("suboptimality_improvement_interval")
         if ends:
@@ -88,7 +91,7 @@ def _by_group(
     names = [name for name, _ in _methods(groups[0][1])]
     for axis, (key, title) in zip(figure.subplots(1, len(_PANELS)), _PANELS):
         scale = 1.0 if key == "mean_iterations" else 100.0
-        for name, color in zip(names, _COLORS):
+        for name, color in zip(names, itertools.cycle(_COLORS)):
             rows = [(x, group[name]) for x, group in groups if group[name][key] is not None]
             xs = [x for x, _ in rows]
             ys = [scale * row[key] for _, row in rows]

@@ -17,12 +17,10 @@ from art_policy.planner import PlannerConfig, WarmStartPlanner
 from freeflyer_env.planning import (
     SCPConfig,
     SCPResult,
-    race_scp,
+    solve_multistart,
     solve_rel,
     solve_scp,
-    straight_line,
 )
-from freeflyer_env.planning.homotopy import homotopy_starts
 from freeflyer_env.robot import Robot
 from freeflyer_env.sampling import sample_obstacles, sample_problem
 from freeflyer_env.scenario import HELD_OUT_SCENES, Problem, Scenario
@@ -203,7 +201,8 @@ def evaluate_problem(
         for label, setting in settings.items():
             plan = WarmStartPlanner(model, setting).plan(problem)
             outcomes[label] = _outcome(plan.result, plan.timings["total"])
-    budget = max((o.time for label, o in outcomes.items() if "best of" in label), default=0.0)
+    several = [outcome.time for label, outcome in outcomes.items() if "best of" in label]
+    budget = several[0] if several else 0.0
     counts = sorted({*_MULTI_START, min(8, n_starts), n_starts})
     raced = {
         count: _timed(lambda: _multi_start(problem, count, config))  # noqa: B023
@@ -221,11 +220,8 @@ def evaluate_problem(
 
 def _multi_start(problem: Problem, n_starts: int, config: SCPConfig) -> SCPResult:
     """The best that a race from REL and other homotopy classes leads to."""
-    rel = solve_rel(problem, config)
-    if problem.defects():
-        return rel
-    starts = [rel.trajectory or straight_line(problem), *homotopy_starts(problem, n_starts - 1)]
-    return min(race_scp(problem, starts, config), key=lambda result: result.cost)
+    results = solve_multistart(problem, n_starts, config, effort="best").results
+    return min(results, key=lambda result: result.cost)
 
 
 def _timed(solve: Callable[[], SCPResult]) -> Outcome:

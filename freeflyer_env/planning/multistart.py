@@ -119,10 +119,12 @@ def race_scp(
     Args:
         problem: What to solve.
         warm_starts: References, each with ``problem.n_steps`` controls; at least one.
-        config: Settings of every loop; ``reroutes`` plays no part, the warm starts are the routes.
+        config: Settings of every loop, but for the time limit, which is that of the race;
+            ``reroutes`` plays no part, the warm starts are the routes.
 
     Returns:
-        One result per warm start, in their order; those given up have the status ``OUTRUN``.
+        One result per warm start, in their order; those given up have the status ``OUTRUN``. The
+        time of each is that of the race.
 
     Raises:
         ValueError: Without a warm start.

@@ -74,7 +74,10 @@ class RecedingHorizon:
         starts += self.propose(problem)
         if not starts:
             return solve_scp(problem, None, self.config)
-        return min(race_scp(problem, starts, self.config), key=lambda result: result.cost)
+        best = min(race_scp(problem, starts, self.config), key=lambda result: result.cost)
+        if best.solved or not self.config.reroutes:
+            return best
+        return solve_scp(problem, starts[0], self.config)
 
     def problem_from(self, state: FloatArray, time: float) -> Problem:
         """The problem that is left at ``time``: obstacles moved on, heading near the plan's."""

@@ -69,7 +69,10 @@ def test_a_batch_gives_what_single_calls_give(problems: list[Problem]) -> None:
             np.testing.assert_allclose(one.trajectory.states, other.trajectory.states, atol=1e-5)
 
 
-def test_a_goal_to_the_left_is_planned_in_a_mirror(problems: list[Problem]) -> None:
+@pytest.mark.parametrize("config", [MULTI, SEQUENCE], ids=["hypotheses", "sequence"])
+def test_a_goal_to_the_left_is_planned_in_a_mirror(
+    config: ARTConfig, problems: list[Problem]
+) -> None:
     problem, sign = problems[0], np.array([-1.0, 1.0, -1.0, -1.0, 1.0, -1.0])
     scenario = problem.scenario
     shift = np.array([scenario.table[0], 0, 0, 0, 0, 0])
@@ -79,9 +82,11 @@ def test_a_goal_to_the_left_is_planned_in_a_mirror(problems: list[Problem]) -> N
     image = Problem(
         scene, shift + sign * problem.start, shift + sign * problem.goal, problem.final_time
     )
-    art = model(MULTI)
-    expected = shift + sign * propose(art, problem)[0].trajectory.states
-    np.testing.assert_allclose(propose(art, image)[0].trajectory.states, expected, atol=1e-5)
+    art = model(config)
+    rel, mirrored = (solve_rel(each).trajectory for each in (problem, image))
+    expected = shift + sign * propose(art, problem, rel=rel)[0].trajectory.states
+    found = propose(art, image, rel=mirrored)[0].trajectory.states
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 def test_decoded_poses_follow_the_knots_where_nothing_is_in_the_way() -> None:

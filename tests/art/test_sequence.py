@@ -150,6 +150,10 @@ def test_decoys_leave_the_cheapest_optimum_what_it_is(dataset: PackedDataset) ->
     assert (batch.problems.present.sum(1) > n_before + 2).float().mean() > 0.3
     assert batch.problems.discs[..., 3:].any()
     assert not training.batch(index, None).problems.present[:, n_before.max() :].any()
+    fewer = HypothesisSet(dataset, every, (LENGTH, WIDTH), max_discs=3)
+    capped = fewer.batch(index, torch.Generator().manual_seed(3)).problems.present.sum(1)
+    assert (capped <= n_before.clamp(min=3)).all()
+    assert (capped > n_before).any() or (n_before >= 3).all()
     for row in range(0, len(index), 4):
         problem = to_problem(batch.problems[torch.tensor([row])])
         knots = batch.paths[row, 0].numpy()

@@ -134,6 +134,17 @@ def test_other_knots_and_more_hypotheses_begin_with_the_same_paths(
     torch.testing.assert_close(ours[:4], theirs, atol=0.0, rtol=0.0)
 
 
+def test_training_from_a_model_keeps_its_scales(dataset: PackedDataset, tmp_path: Path) -> None:
+    train(dataset, TINY_SEQUENCE, replace(SHORT, max_steps=1), tmp_path / "first")
+    first = ART.from_pretrained(tmp_path / "first")
+    with torch.no_grad():
+        first.net.control_scale.mul_(2.0)
+    first.save_pretrained(tmp_path / "first")
+    config = replace(SHORT, max_steps=1, init=str(tmp_path / "first"))
+    second = train(dataset, TINY_SEQUENCE, config, tmp_path / "second")
+    torch.testing.assert_close(second.net.control_scale, first.net.control_scale)
+
+
 def test_validation_problems_are_never_trained_on(dataset: PackedDataset) -> None:
     training, validation = dataset.split(0.2)
     ours = set(dataset.problem_index[training])
