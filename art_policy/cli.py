@@ -30,7 +30,7 @@ from art_policy.cli_io import (
 from art_policy.cli_models import evaluate_models, export_model, train_model
 from freeflyer_datasets.generate import ENGINES, GenerationError
 
-DEFAULT_MODEL = "art-scene-random"
+DEFAULT_MODEL = "art-general"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

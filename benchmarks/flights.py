@@ -101,7 +101,7 @@ def _fly(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", default="art-scene-random")
+    parser.add_argument("--model", default="art-general")
     parser.add_argument("--candidates", type=int, default=4)
     parser.add_argument("--flights", type=int, default=100, help="flights of each method")
     choices = ("PID", "MPC", _REPLANNING)

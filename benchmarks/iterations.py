@@ -92,7 +92,7 @@ def measure(model_name: str, n_problems: int) -> list[Row]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--model", default="art-scene-random")
+    parser.add_argument("--model", default="art-general")
     parser.add_argument("--problems", type=int, default=150)
     parser.add_argument("--out", type=Path, help="JSON file")
     options = parser.parse_args()

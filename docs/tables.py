@@ -9,7 +9,10 @@ A page says where a table comes from in a comment, and this script fills in what
     <!-- end of table -->
 
 that is a report of ``freeflyer evaluate``, a group of its problems, and the methods to show. With
-``cells`` as the group, numbers of obstacles and final times are set against one another.
+``cells`` as the group, numbers of obstacles and final times are set against one another. Of the
+JSON of a benchmark it is the way to a list of rows, and the columns to show::
+
+    <!-- table: docs/results/flights.json | tables/held-out, 40 s/flights | tracker; RMS, mm -->
 """
 
 from __future__ import annotations
@@ -44,7 +47,12 @@ def filled(page: str) -> str:
 
 def _table(source: str) -> str:
     path, group, methods = (part.strip() for part in source.split("|"))
-    groups = json.loads((ROOT / path).read_text(encoding="utf-8"))["groups"]
+    data = json.loads((ROOT / path).read_text(encoding="utf-8"))
+    if "groups" not in data:
+        for key in group.split("/"):
+            data = data[key]
+        return _rows(data, [name.strip() for name in methods.split(";")])
+    groups = data["groups"]
     if group == "cells":
         return _grid(groups, *(name.strip() for name in methods.split(";")))
     if group not in groups:
@@ -56,6 +64,21 @@ def _table(source: str) -> str:
         row = groups[group][method]
         rows[method] = {key: math.nan if row[key] is None else row[key] for key in row}
     return f"\n{markdown_table(rows)}\n\n"
+
+
+def _rows(rows: list[dict[str, Any]], columns: list[str]) -> str:
+    """Rows of a benchmark: numbers to three digits."""
+    if unknown := set(columns) - set(rows[0]):
+        raise ValueError(f"There is no column {sorted(unknown)}, only {'; '.join(rows[0])}.")
+
+    def text(value: Any) -> str:
+        if not isinstance(value, float):
+            return str(value)
+        return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.3g}"
+
+    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    lines += ["| " + " | ".join(text(row[name]) for name in columns) + " |" for row in rows]
+    return "\n" + "\n".join(lines) + "\n\n"
 
 
 def _grid(groups: dict[str, Any], base: str, method: str) -> str:

@@ -9,7 +9,7 @@ from freeflyer_env.control import fly
 
 
 def main() -> None:
-    planner = WarmStartPlanner(ART.from_pretrained("art-scene-random"))
+    planner = WarmStartPlanner(ART.from_pretrained("art-general"))
     env = gym.make(
         "freeflyer_env:FreeFlyer-v0",
         action_mode="thrusters",

@@ -88,7 +88,8 @@ def _by_group(
 ) -> Path:
     """Three panels of all methods over a quantity that the problems are grouped by."""
     figure = _figure(10.0, 3.4)
-    names = [name for name, _ in _methods(groups[0][1])]
+    # Not everything is defined in every group: without obstacles there is no gap to close.
+    names = dict.fromkeys(name for _, group in groups for name, _ in _methods(group))
     for axis, (key, title) in zip(figure.subplots(1, len(_PANELS)), _PANELS):
         scale = 1.0 if key == "mean_iterations" else 100.0
         for name, color in zip(names, itertools.cycle(_COLORS)):

@@ -26,16 +26,19 @@ PAPER = {
 
 _RESAMPLES = 1000
 
+#: Relative gap between REL + SCP and the bound below which SCP's tolerance is all there is to it.
+_LEAST_GAP = 1e-4
+
 
 def summarise(records: Sequence[ProblemRecord]) -> dict[str, dict[str, Any]]:
     """The protocol's figures per method, over the given problems.
 
     Costs and iterations are means over the problems that REL's bound and all methods were solved
     for (``n_common``), times are of all problems. ``suboptimality_improvement`` is
-    ``(J_REL+SCP - J) / (J_REL+SCP - J_REL)`` of those means, against REL; the infeasible rate has
-    its Wilson 95 % interval, the improvements have that of a paired bootstrap over problems
-    (``*_interval``). The last row, ``best known``, is the cheapest solution of any method and
-    start.
+    ``(J_REL+SCP - J) / (J_REL+SCP - J_REL)`` of those means, against REL, undefined where there is
+    no gap; the infeasible rate has its Wilson 95 % interval, the improvements have that of a paired
+    bootstrap over problems (``*_interval``). The last row, ``best known``, is the cheapest solution
+    of any method and start.
     """
     names = list(records[0].outcomes) if records else []
     common = [r for r in records if all(o.solved for o in r.outcomes.values()) and r.rel_cost > 0]
@@ -97,7 +100,9 @@ def _improvements(
             gap = bases[..., 0] - bounds
             saved = bases[..., 0] - others[..., 0]
             return {
-                "suboptimality_improvement": np.where(gap > 0, saved / gap, np.nan),
+                "suboptimality_improvement": np.where(
+                    gap > _LEAST_GAP * bases[..., 0], saved / gap, np.nan
+                ),
                 "cost_improvement": saved / bases[..., 0],
                 "iterations_improvement": 1.0 - others[..., 1] / bases[..., 1],
             }
@@ -161,7 +166,9 @@ def markdown_table(summary: dict[str, dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|",
     ]
     for name, row in summary.items():
-        improvement = f"{row['suboptimality_improvement']:+.1%}"
+        improvement = "-"
+        if np.isfinite(row["suboptimality_improvement"]):
+            improvement = f"{row['suboptimality_improvement']:+.1%}"
         if name != "REL" and "suboptimality_improvement_interval" in row:
             low, high = row["suboptimality_improvement_interval"]
             improvement += f" ({low:+.1%} to {high:+.1%})"

@@ -1,10 +1,12 @@
 """The evaluation protocol: its problems, its arithmetic, its report."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from art_policy.evaluation import (
     Outcome,
@@ -75,6 +77,20 @@ def test_the_best_known_is_better_than_any_method_alone():
     assert figures["ART"]["suboptimality_improvement"] == pytest.approx(0.0)
     assert figures["best known"]["suboptimality_improvement"] == pytest.approx(1 / 3)
     assert figures["best known"]["infeasible"] == 0
+
+
+def test_without_a_gap_there_is_no_improvement(tmp_path):
+    free = [record(1.0, {"REL": (1.0, 2), "ART": (1.0 + 1e-7, 2)})]
+    summary = summarise(free)
+    assert np.isnan(summary["ART"]["suboptimality_improvement"])
+    assert "| - |" in markdown_table(summary).splitlines()[-2]
+    # Its figure shows the other numbers of obstacles all the same.
+    free = [replace(each, n_obstacles=0) for each in free]
+    others = [record(1.0, {"REL": (2.0, 4), "ART": (1.5, 3)})]
+    figures(report(free + others, "model"), tmp_path)
+    with Image.open(tmp_path / "by_obstacles.png") as picture:
+        colors = {color for _, color in picture.convert("RGB").getcolors(1 << 20)}
+    assert {(127, 135, 148), (183, 189, 200)} <= colors  # both methods' lines
 
 
 def test_problems_are_reproducible_and_spread():
