@@ -8,7 +8,8 @@ from typing import Any
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-_SIZE, _SECONDS = 2048, 0.3  # of the matrix product that a machine is measured by
+#: Sizes of the matrix products that a machine is measured by; one that takes longer is not doubled.
+_SMALLEST, _SIZE, _SECONDS = 256, 2048, 0.02
 
 
 def flops_per_example(model: Any, training: Any, count: int = 16) -> float:
@@ -28,13 +29,22 @@ def flops_per_example(model: Any, training: Any, count: int = 16) -> float:
 
 
 def peak_flops(device: torch.device, dtype: torch.dtype) -> float:
-    """Operations a second that a large matrix product reaches here, with the threads set."""
-    a = torch.randn(_SIZE, _SIZE, device=device).to(dtype)
-    a @ a
-    began, count = time.perf_counter(), 0
-    while time.perf_counter() - began < _SECONDS:
+    """Operations a second that a large matrix product reaches here, with the threads set.
+
+    A processor without instructions for ``dtype`` gets a smaller one, or it would take minutes.
+    """
+    size = _SMALLEST
+    while (elapsed := _product_seconds(size, device, dtype)) < _SECONDS and size < _SIZE:
+        size *= 2
+    fastest = min([elapsed, *(_product_seconds(size, device, dtype) for _ in range(3))])
+    return 2.0 * size**3 / fastest
+
+
+def _product_seconds(size: int, device: torch.device, dtype: torch.dtype) -> float:
+    a = torch.randn(size, size, device=device).to(dtype)
+    for _ in range(2):  # the second one is warm
+        began = time.perf_counter()
         a @ a
-        count += 1
         if device.type == "cuda":
             torch.cuda.synchronize()
-    return 2.0 * _SIZE**3 * count / (time.perf_counter() - began)
+    return time.perf_counter() - began
