@@ -226,17 +226,51 @@ class PackedDataset:
         n_steps = self.offsets[rows + 1] - self.offsets[rows]
         if (begin < 0).any() or (begin >= n_steps).any() or length < 1:
             raise ValueError("Windows must begin within their trajectories and have a length.")
-        step = np.arange(int(n_steps.max(initial=0)))
-        before = step < n_steps[:, None]
-        position = np.where(before, self.offsets[rows][:, None] + step, 0)
-        whole = np.where(before[..., None], self.controls[position], np.float32(0.0))
-        start = np.asarray(self.start[self.problem_index[rows]])
-        states = dynamics.rollout(start, whole, self.dt, self.robot)
-        ahead = begin[:, None] + np.arange(length)
-        inside, row = ahead < n_steps[:, None], np.arange(len(rows))[:, None]
-        controls = whole[row, np.minimum(ahead, len(step) - 1)]
-        controls[~inside] = 0.0
-        return states[row, np.minimum(ahead, n_steps[:, None])], controls, inside
+        # Step by step, the windows side by side: sums over steps are additions of whole rows.
+        ahead = begin + np.arange(length)[:, None]  # (K, B)
+        inside = ahead < n_steps
+        # (`take` is four times as fast as an array of indices in brackets.)
+        position = self.offsets[rows] + np.minimum(ahead, n_steps - 1)
+        controls = np.asarray(self.controls).take(position.ravel(), axis=0).reshape(length, -1)
+        controls *= np.repeat(inside, 3, axis=1)
+        rates = controls[:-1] * np.tile(self.robot.control_gain, len(rows))
+        # A last impulse is not followed by a drift, so that pose and rates are those of the end.
+        poses = np.repeat(np.where(ahead[:-1] < n_steps - 1, self.dt, 0.0), 3, axis=1)
+        state = self._states_at(rows, begin)
+        pose, rate = state[:, :3].ravel(), state[:, 3:].ravel()
+        for rates_after, poses_after in zip(rates, poses):
+            rate = np.add(rate, rates_after, out=rates_after)
+            poses_after *= rate
+            pose = np.add(pose, poses_after, out=poses_after)
+        states = np.empty((len(rows), length, 6))
+        states[:, 0] = state
+        shape = (length - 1, len(rows), 3)
+        states[:, 1:, :3] = poses.reshape(shape).swapaxes(0, 1)
+        states[:, 1:, 3:] = rates.reshape(shape).swapaxes(0, 1)
+        by_window = np.ascontiguousarray(controls.reshape(length, -1, 3).swapaxes(0, 1))
+        return states, by_window, np.ascontiguousarray(inside.T)
+
+    def _states_at(self, rows: NDArray[np.int64], step: NDArray[np.int64]) -> FloatArray:
+        """States ``(B, 6)`` of trajectories before one of their steps each, ``(B,)``.
+
+        Two sums over the controls before step ``k`` are enough: ``v_k = v_0 + sum u_i``, and
+        ``p_k = p_0 + dt (k v_0 + sum (k - i) u_i)``.
+        """
+        state = np.asarray(self.start[self.problem_index[rows]])
+        # The controls of all trajectories in one run, summed piece by piece.
+        ends = np.cumsum(step)
+        begins, number = ends - step, np.arange(step.sum())
+        position = number + np.repeat(self.offsets[rows] - begins, step)
+        controls = np.asarray(self.controls).take(position, axis=0).astype(np.float64)
+        moved, impulse, weighted = step > 0, np.zeros((len(rows), 3)), np.zeros((len(rows), 3))
+        if len(number):
+            impulse[moved] = np.add.reduceat(controls, begins[moved])
+            controls *= (np.repeat(ends, step) - number)[:, None]
+            weighted[moved] = np.add.reduceat(controls, begins[moved])
+        gain = self.robot.control_gain
+        state[:, :3] += self.dt * (step[:, None] * state[:, 3:] + weighted * gain)
+        state[:, 3:] += impulse * gain
+        return state
 
     def transitions(self, indices: ArrayLike | None = None) -> dict[str, NDArray[np.float32]]:
         """Trajectories as flat arrays, one row a step, for offline-RL libraries such as d3rlpy.
