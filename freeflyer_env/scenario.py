@@ -176,16 +176,16 @@ class Scenario:
                 f"Scenario.keep_out_factor must be at least 1, got {self.keep_out_factor}."
             )
 
-    @property
+    @cached_property
     def keep_out_radii(self) -> FloatArray:
         """``(M,)`` radii in m that the robot's centre stays out of."""
-        return (self.obstacles.radii + self.robot.radius) * self.keep_out_factor
+        return _read_only((self.obstacles.radii + self.robot.radius) * self.keep_out_factor)
 
-    @property
+    @cached_property
     def position_limits(self) -> tuple[FloatArray, FloatArray]:
         """Lower and upper limit ``(2,)`` of the robot's centre in m."""
         margin = self.robot.radius
-        return np.full(2, margin), np.asarray(self.table) - margin
+        return _read_only(np.full(2, margin)), _read_only(np.asarray(self.table) - margin)
 
     @classmethod
     def named(cls, name: str) -> Scenario:
@@ -199,6 +199,11 @@ class Scenario:
             hint = f" Did you mean {near[0]!r}?" if near else ""
             raise ValueError(f"No scene is called {name!r}.{hint} Known: {', '.join(SCENES)}.")
         return cls(obstacles=SCENES[name])
+
+
+def _read_only(array: FloatArray) -> FloatArray:
+    array.setflags(write=False)
+    return array
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,13 +253,18 @@ class Problem:
         """Number ``N`` of controls."""
         return round(self.final_time / self.scenario.dt)
 
-    @property
+    @cached_property
     def node_times(self) -> FloatArray:
         """``(N + 1,)`` times of the states in s; the last impulse takes no time."""
-        return self.scenario.dt * np.minimum(np.arange(self.n_steps + 1), self.n_steps - 1)
+        step = np.minimum(np.arange(self.n_steps + 1), self.n_steps - 1)
+        return _read_only(self.scenario.dt * step)
 
     def defects(self) -> list[str]:
         """Why no trajectory can solve this problem, one line per reason; empty if none is seen."""
+        return list(self._defects)
+
+    @cached_property
+    def _defects(self) -> tuple[str, ...]:
         lines = []
         low, high = self.scenario.position_limits
         times = self.node_times[[0, -1]]
@@ -274,7 +284,7 @@ class Problem:
                         f"the {name} is inside the keep-out zone of obstacle {index}: {gap:.3f} m "
                         f"from its centre, at least {radius:.3f} m needed; move one of them"
                     )
-        return lines
+        return tuple(lines)
 
     def require_valid(self) -> Problem:
         """Returns itself, or raises a ``ValueError`` with the :meth:`defects` in one line."""

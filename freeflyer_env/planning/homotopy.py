@@ -82,23 +82,28 @@ def push_out(
         rounds: Most rounds.
         times: When, in s, to broadcast with ``(...)``; matters only if obstacles move.
     """
-    positions = np.array(positions, dtype=np.float64)
+    # Coordinate by coordinate: contiguous rows are twice as fast as pairs.
+    x, y = (np.array(positions[..., axis], dtype=np.float64) for axis in range(2))
     low, high = scenario.position_limits
     obstacles = scenario.obstacles
     centres = obstacles.centres_at(times) if obstacles.moving else obstacles.centres
     for _ in range(rounds):
-        before = positions.copy()
+        before = x.copy(), y.copy()
         for index, radius in enumerate(scenario.keep_out_radii):
-            centre = np.broadcast_to(centres[..., index, :], positions.shape)
-            offset = positions - centre
-            distance = np.sqrt(offset[..., 0] ** 2 + offset[..., 1] ** 2)
+            c_x, c_y = centres[..., index, 0], centres[..., index, 1]
+            away_x, away_y = x - c_x, y - c_y
+            distance = np.sqrt(away_x**2 + away_y**2)
             inside = distance < radius + margin
-            stretch = (radius + margin) / np.maximum(distance[inside], 1e-9)
-            positions[inside] = centre[inside] + offset[inside] * stretch[:, None]
-        np.clip(positions, low, high, out=positions)
-        if np.abs(before - positions).max(initial=0.0) <= 1e-9:
+            if inside.any():
+                stretch = (radius + margin) / np.maximum(distance, 1e-9)
+                np.copyto(x, c_x + away_x * stretch, where=inside)
+                np.copyto(y, c_y + away_y * stretch, where=inside)
+        np.clip(x, low[0], high[0], out=x)
+        np.clip(y, low[1], high[1], out=y)
+        moved = max(np.abs(a - b).max(initial=0.0) for a, b in zip(before, (x, y)))
+        if moved <= 1e-9:
             break
-    return positions
+    return np.stack([x, y], axis=-1)
 
 
 def _halted(problem: Problem) -> Problem:
@@ -148,17 +153,33 @@ def _grid_paths(problem: Problem) -> FloatArray:
     low, high = problem.scenario.position_limits
     x = low[0] + (high[0] - low[0]) * np.array([0.27, 0.5, 0.73])
     y = low[1] + (high[1] - low[1]) * np.array([0.05, 0.28, 0.5, 0.72, 0.95])
-    vias = [[(x[i], y[j])] for i, j in itertools.product(range(3), range(5))]
-    vias += [[(x[0], y[i]), (x[2], y[j])] for i, j in itertools.permutations(range(5), 2)]
+    one = [[(x[i], y[j])] for i, j in itertools.product(range(3), range(5))]
+    two = [[(x[0], y[i]), (x[2], y[j])] for i, j in itertools.permutations(range(5), 2)]
     # Start and goal may lie the other way round; the points are passed in that order.
-    backwards = problem.goal[0] < problem.start[0]
+    order = -1 if problem.goal[0] < problem.start[0] else 1
     paths = []
-    for via in vias:
-        corners = np.array([problem.start[:2], *via[:: -1 if backwards else 1], problem.goal[:2]])
-        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-        samples = np.linspace(0.0, arc[-1], _SAMPLES)
-        paths.append(np.column_stack([np.interp(samples, arc, corners[:, k]) for k in range(2)]))
-    return np.array(paths)
+    for vias in (np.array(one), np.array(two)):
+        corners = np.empty((len(vias), vias.shape[1] + 2, 2))
+        corners[:, 0], corners[:, -1] = problem.start[:2], problem.goal[:2]
+        corners[:, 1:-1] = vias[:, ::order]
+        paths.append(_along(corners))
+    return np.concatenate(paths)
+
+
+def _along(corners: FloatArray) -> FloatArray:
+    """Equally spaced points ``(C, P, 2)`` along the polygons of ``corners`` ``(C, K, 2)``."""
+    legs = np.diff(corners, axis=1)
+    lengths = np.sqrt(legs[..., 0] ** 2 + legs[..., 1] ** 2)
+    arc = np.zeros(corners.shape[:2])
+    np.cumsum(lengths, axis=1, out=arc[:, 1:])
+    samples = np.linspace(0.0, arc[:, -1], _SAMPLES, axis=1)
+    # On which leg each point is; the last point is the last corner.
+    leg = (samples[:, :, None] >= arc[:, None, 1:-1]).sum(axis=2)
+    rows = np.arange(len(corners))[:, None]
+    slope = legs / np.maximum(np.diff(arc, axis=1), 1e-300)[..., None]
+    points = slope[rows, leg] * (samples - arc[rows, leg])[..., None] + corners[rows, leg]
+    points[:, -1] = corners[:, -1]
+    return points
 
 
 def _trapezoid(n: int, ramp: float = 0.15) -> FloatArray:

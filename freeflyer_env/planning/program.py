@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import sparse
@@ -53,6 +54,11 @@ class ConvexProgram:
     x_lower: FloatArray
     x_upper: FloatArray
     balls: Balls | None = None
+
+    @cached_property
+    def transposes(self) -> tuple[sparse.csr_matrix, sparse.csr_matrix]:
+        """Of ``A`` and ``G``; they share the values, also those that are written later."""
+        return self.a.transpose(copy=False), self.g.transpose(copy=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +137,8 @@ def kkt_residuals(program: ConvexProgram, solution: Solution) -> KKTResiduals:
         np.maximum(rows - p.h_upper, p.h_lower - rows),
         np.maximum(x - p.x_upper, p.x_lower - x),
     ]
-    gradient = p.c + p.a.T @ solution.y + p.g.T @ solution.z + solution.w
+    a_transposed, g_transposed = p.transposes
+    gradient = p.c + a_transposed @ solution.y + g_transposed @ solution.z + solution.w
     dual = -(solution.y @ p.b) - _support(solution.z, p.h_lower, p.h_upper)
     dual -= _support(solution.w, p.x_lower, p.x_upper)
     if p.balls is not None:

@@ -19,8 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from freeflyer_env.constraints import FEASIBILITY_TOLERANCE
-from freeflyer_env.constraints import check as check_constraints
+from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, ConstraintReport
 from freeflyer_env.planning.backends import CVXPY_PREFIX, check_backend
 from freeflyer_env.planning.homotopy import homotopy_starts
 from freeflyer_env.planning.infeasibility import why_infeasible
@@ -319,6 +318,7 @@ class SCPLoop:
         self._costs: list[float] = []
         self._trajectory: Trajectory | None = None
         self._kkt: KKTResiduals | None = None
+        self._report: ConstraintReport | None = None  # of the trajectory, once it has settled
         self._status: SCPStatus | None = None
         self.iterations = 0
 
@@ -373,7 +373,8 @@ class SCPLoop:
             and moved <= config.state_tolerance
             and abs(self._costs[-1] - self._costs[-2]) < config.cost_tolerance
         )
-        if settled and _verified(self._problem, trajectory, self._keep_out, config.between_nodes):
+        self._report = trajectory.check(self._problem) if settled else None
+        if self._report and self._satisfied(trajectory, self._report):
             self._status, self._kkt = SCPStatus.SOLVED, solver.kkt_residuals()
         elif self.iterations == config.max_iterations or (
             # Settled with slack left: more iterations would only pay for it again.
@@ -381,6 +382,15 @@ class SCPLoop:
         ):
             left = self._slack > FEASIBILITY_TOLERANCE
             self._status = SCPStatus.SLACK_LEFT if left else SCPStatus.ITERATION_LIMIT
+
+    def _satisfied(self, trajectory: Trajectory, report: ConstraintReport) -> bool:
+        """Whether a trajectory satisfies all that this loop imposes."""
+        if not self._keep_out:
+            return replace(report, keep_out=0.0).satisfied()
+        between_nodes = self._config.between_nodes
+        if between_nodes and trajectory.between_nodes_depth(self._problem) > FEASIBILITY_TOLERANCE:
+            return False
+        return report.satisfied()
 
     def result(self) -> SCPResult:
         """How the loop ended."""
@@ -392,7 +402,9 @@ class SCPLoop:
                 status = SCPStatus.INFEASIBLE_PROBLEM
                 message = f"{status.remedy[:-1]}: {reason}."
         trajectory = self._trajectory
-        report = trajectory.check(self._problem) if trajectory else None
+        report = self._report
+        if report is None and trajectory is not None:
+            report = trajectory.check(self._problem)
         elapsed = time.perf_counter() - self._began
         return SCPResult(
             status,
@@ -404,17 +416,6 @@ class SCPLoop:
             message,
             self._kkt,
         )
-
-
-def _verified(
-    problem: Problem, trajectory: Trajectory, keep_out: bool, between_nodes: bool
-) -> bool:
-    report = check_constraints(problem, trajectory.states, trajectory.controls)
-    if not keep_out:
-        return replace(report, keep_out=0.0).satisfied()
-    if between_nodes and trajectory.between_nodes_depth(problem) > FEASIBILITY_TOLERANCE:
-        return False
-    return report.satisfied()
 
 
 def _failure(status: SCPStatus, began: float, detail: str) -> SCPResult:

@@ -80,8 +80,10 @@ class Subproblem:
         self.backend, self.elastic, self.between_nodes = backend, elastic, between_nodes
         self.ball, self.velocity_rows = ball, velocity_rows
         self._with_velocity_rows: Subproblem | None = None
+        self._problem: Problem | None = None  # of which the dynamics are set
         delta_v_max = robot.delta_v_max(dt)
         self._scale = delta_v_max * np.array([1.0, 1.0, robot.lever_arm])
+        self._unit = robot.cluster_inverse / delta_v_max
         self._index_variables()
         prices = np.zeros(self._n_variables)
         prices[self._split_columns] = self._scale / delta_v_max
@@ -117,7 +119,9 @@ class Subproblem:
             slack_price: Price of a metre of slack at one node, in multiples of the largest delta-V;
                 for the elastic form.
         """
-        self._set_dynamics(problem)
+        if problem is not self._problem:
+            self._set_dynamics(problem)
+            self._problem = problem
         self._set_actuation(problem, reference)
         self._set_keep_out(problem, reference)
         self._set_bounds(problem, reference, trust_region)
@@ -261,16 +265,17 @@ class Subproblem:
 
     def _set_actuation(self, problem: Problem, reference: Trajectory) -> None:
         psi, data = reference.states[:-1, 2], self._program.g.data
-        cos, sin, n = np.cos(psi), np.sin(psi), self.n_steps
-        rotation, slope = np.zeros((n, 3, 3)), np.zeros((n, 3, 3))
-        rotation[:, 0, 0] = rotation[:, 1, 1] = cos
-        rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 2, 2] = sin, -sin, 1.0
-        slope[:, 0, 0] = slope[:, 1, 1] = -sin
-        slope[:, 0, 1], slope[:, 1, 0] = cos, -cos
-        unit = self.robot.cluster_inverse / self.robot.delta_v_max(self.dt)
-        split = unit @ rotation * self._scale
-        data[self._slots["act_split"]] = np.concatenate([split, -split], axis=2).ravel()
-        gradient = (unit @ slope @ reference.controls[:, :, None])[:, :, 0]
+        cos, sin = np.cos(psi)[:, None], np.sin(psi)[:, None]
+        x, y, turn = self._unit.T
+        split = np.empty((self.n_steps, 4, 6))  # M(psi), and its negative
+        split[:, :, 0] = (cos * x - sin * y) * self._scale[0]
+        split[:, :, 1] = (sin * x + cos * y) * self._scale[1]
+        split[:, :, 2] = turn * self._scale[2]
+        np.negative(split[:, :, :3], out=split[:, :, 3:])
+        data[self._slots["act_split"]] = split.ravel()
+        slope = np.zeros((self.n_steps, 4, 3))  # M'(psi)
+        slope[:, :, 0], slope[:, :, 1] = -sin * x - cos * y, cos * x - sin * y
+        gradient = (slope @ reference.controls[:, :, None])[:, :, 0]
         data[self._slots["act_psi"]] = gradient[1:-1].ravel()
         shift = gradient * psi[:, None]
         # At the two ends psi is given, and all of the linearisation is on the right-hand side.
@@ -284,17 +289,21 @@ class Subproblem:
             return
         scenario = problem.scenario
         centres = scenario.obstacles.centres_at(problem.node_times[:-1])
-        across = np.array([problem.start[1] - problem.goal[1], problem.goal[0] - problem.start[0]])
-        across = across / max(float(np.linalg.norm(across)), 1e-12)
         relative = reference.states[:-1, None, :2] - centres
-        distance = np.linalg.norm(relative[1:-1], axis=-1, keepdims=True)
-        # A reference on the very centre has no outward normal: any side will do, take the left one.
-        normal = np.where(distance > 1e-9, relative[1:-1] / np.maximum(distance, 1e-9), across)
+        x, y = relative[1:-1, :, :1], relative[1:-1, :, 1:]
+        distance = np.sqrt(x * x + y * y)
+        normal = relative[1:-1] / np.maximum(distance, 1e-9)
+        if distance.min(initial=1.0) <= 1e-9:
+            # A reference on the very centre has no outward normal: any side will do, take the left.
+            way = problem.goal[:2] - problem.start[:2]
+            left = np.array([-way[1], way[0]]) / max(float(np.linalg.norm(way)), 1e-12)
+            normal = np.where(distance > 1e-9, normal, left)
         radii = scenario.keep_out_radii
         if self.between_nodes:
             radii = _widened(radii, relative)
         self._program.g.data[self._slots["keep"]] = normal.ravel()
-        self._program.h_lower[self._keep_rows] = (normal * centres[1:-1]).sum(-1) + radii
+        level = normal[..., 0] * centres[1:-1, :, 0] + normal[..., 1] * centres[1:-1, :, 1]
+        self._program.h_lower[self._keep_rows] = level + radii
 
     def _set_bounds(self, problem: Problem, reference: Trajectory, trust_region: float) -> None:
         poses = reference.states[1:-2, :3]

@@ -55,14 +55,16 @@ class Trajectory:
             with_controls: Whether the controls are those that the poses imply (they may exceed the
                 actuation limit), or zero.
         """
-        poses = np.array(poses, dtype=np.float64)
-        poses[0], poses[-1] = problem.start[:3], problem.goal[:3]
-        dt, robot = problem.scenario.dt, problem.scenario.robot
-        rates = np.vstack([problem.start[3:], np.diff(poses, axis=0) / dt, problem.goal[3:]])
-        states = np.hstack([np.vstack([poses, poses[-1:]]), rates])
-        controls = np.zeros((len(poses), 3))
+        dt, robot, n = problem.scenario.dt, problem.scenario.robot, len(poses)
+        states = np.empty((n + 1, 6))
+        states[:n, :3], rates = poses, states[:, 3:]
+        states[0] = problem.start
+        states[-2, :3], states[-1] = problem.goal[:3], problem.goal
+        np.subtract(states[1:n, :3], states[: n - 1, :3], out=rates[1:n])
+        rates[1:n] /= dt
+        controls = np.zeros((n, 3))
         if with_controls:
-            controls = np.diff(rates, axis=0) / robot.control_gain
+            controls = (rates[1:] - rates[:-1]) / robot.control_gain
         return cls(states, controls, dt)
 
     def stretched(self, problem: Problem) -> Trajectory:
