@@ -287,8 +287,9 @@ def keep_out_depth(discs: Tensor, positions: Tensor) -> Tensor:
 
 def reverse_controls(controls: Tensor, n_steps: Tensor) -> Tensor:
     """Controls ``(B, L, 3)`` of the trajectories reversed in time and mirrored in x."""
-    index = n_steps[:, None] - 1 - torch.arange(controls.shape[1])
-    rows = torch.arange(len(controls))[:, None]
+    device = controls.device
+    index = n_steps[:, None] - 1 - torch.arange(controls.shape[1], device=device)
+    rows = torch.arange(len(controls), device=device)[:, None]
     flipped = controls[rows, index.clamp(min=0)] * controls.new_tensor(REVERSE_CONTROL)
     return flipped * (index >= 0)[..., None]
 

@@ -220,6 +220,11 @@ def train(
         torch.set_num_threads(config.threads)
     datasets = list(data) if isinstance(data, Sequence) else [data]
     training, validation = _examples(datasets, model_config, config)
+    if accelerator.device.type == "cuda":
+        # A batch is gathered where it is used; and float32 products there are rounded to 11 bits,
+        # 2 mm of a position, for eight times the speed.
+        training, validation = training.to(accelerator.device), validation.to(accelerator.device)
+        torch.set_float32_matmul_precision("high")
     if not len(training):
         raise ValueError("The dataset has no solved trajectory to train on.")
     model_config = dataclasses.replace(model_config, envelope=training.envelope)
@@ -334,17 +339,22 @@ def _examples(
     splits = [dataset.split(config.validation_fraction) for dataset in datasets]
     pairs = list(zip(datasets, splits))
     if model.head == "autoregressive":
-        settings = (model.table, model.context_length, model.constraint_to_go == "constant")
+        constant = model.constraint_to_go == "constant"
+        settings = (model.table, model.context_length, constant, config.max_optima)
         training, validation = (
             SequenceSet.joined([SequenceSet(d, s[side], *settings) for d, s in pairs])
             for side in range(2)
         )
         return training, validation
-    tails, most = config.tails, config.max_discs if config.augment else None
-    return (
-        HypothesisSet.joined([HypothesisSet(d, s[0], model.table, tails, most) for d, s in pairs]),
-        HypothesisSet.joined([HypothesisSet(d, s[1], model.table) for d, s in pairs]),
-    )
+    most = config.max_discs if config.augment else None
+
+    def hypotheses(side: int, tails: float, max_discs: int | None) -> HypothesisSet:
+        settings: Any = {"tails": tails, "max_discs": max_discs, "max_optima": config.max_optima}
+        return HypothesisSet.joined(
+            [HypothesisSet(d, s[side], model.table, **settings) for d, s in pairs]
+        )
+
+    return hypotheses(0, config.tails, most), hypotheses(1, 0.0, None)
 
 
 def _initialise(model: ART, name: str) -> None:

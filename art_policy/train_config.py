@@ -23,6 +23,7 @@ class TrainConfig:
         gradient_clip: Largest norm of the gradient.
         ema_decay: Decay of the running average of the weights, which is what is saved.
         augment: Whether examples are put under random symmetries of the problem.
+        max_optima: Most optima of one problem that are learned from, cheapest first.
         tails: Multi-hypothesis only: share of the problems of which one is added that begins in
             flight, for re-planning.
         max_discs: Multi-hypothesis only: if given, augmentation adds discs to a scene, until it has
@@ -52,6 +53,7 @@ class TrainConfig:
     gradient_clip: float = 1.0
     ema_decay: float = 0.999
     augment: bool = True
+    max_optima: int = 4
     tails: float = 0.25
     max_discs: int | None = None
     init: str | None = None
@@ -70,6 +72,7 @@ class TrainConfig:
         if self.max_steps is None and self.max_minutes is None:
             raise ValueError("TrainConfig needs max_steps or max_minutes (or both).")
         for name in ("max_steps", "max_minutes", "batch_size", "learning_rate", "gradient_clip",
+                     "max_optima",
                      "max_discs", "log_every", "validate_every", "checkpoint_minutes"):  # fmt: skip
             value = getattr(self, name)
             if value is not None and not value > 0:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -109,9 +110,16 @@ class HypothesisSet:
     def __len__(self) -> int:
         return len(self._examples)
 
+    def to(self, device: torch.device | str) -> HypothesisSet:
+        """The same on another device, where batches are made then."""
+        moved = copy.copy(self)
+        moved._examples = self._examples.to(device)
+        return moved
+
     def batch(self, index: Tensor, generator: torch.Generator | None) -> HypothesisBatch:
         """The examples ``index``, each under a random symmetry if a ``generator`` is given."""
         every = self._examples
+        index = index.to(every.costs.device)
         examples = HypothesisBatch(every.problems[index], every.paths[index], every.costs[index])
         if generator is None:
             return examples
@@ -189,6 +197,7 @@ class SequenceSet:
         table: Size of the table in m, for augmentation.
         length: Number of steps of a window, the model's context length.
         constant_budget: Whether the constraint-to-go stays what it is for the whole trajectory.
+        max_optima: Most optima of one problem that are used, cheapest first.
     """
 
     def __init__(
@@ -198,13 +207,19 @@ class SequenceSet:
         table: tuple[float, float],
         length: int,
         constant_budget: bool = False,
+        max_optima: int = 4,
     ) -> None:
+        kept = np.asarray(dataset.rank)[trajectories] < max_optima
+        trajectories = trajectories[kept]
         problems, slot = np.unique(dataset.problem_index[trajectories], return_inverse=True)
         self._problems = problem_batch(dataset, problems)
         self._slot = torch.from_numpy(slot)
         self._first = torch.from_numpy(dataset.offsets[trajectories])
         self._n_steps = torch.from_numpy(np.diff(dataset.offsets)[trajectories])
-        self._controls = dataset.controls
+        with warnings.catch_warnings():
+            # The file is mapped read-only, and nothing here writes.
+            warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
+            self._controls = torch.from_numpy(np.asarray(dataset.controls))
         self._dt, self._robot = dataset.dt, dataset.robot
         self._table, self._length, self._constant_budget = table, length, constant_budget
 
@@ -220,8 +235,16 @@ class SequenceSet:
         whole._slot = torch.cat([each._slot + n for each, n in zip(sets, problems)])
         whole._first = torch.cat([each._first + n for each, n in zip(sets, steps)])
         whole._n_steps = torch.cat([each._n_steps for each in sets])
-        whole._controls = np.concatenate([each._controls for each in sets])
+        whole._controls = torch.cat([each._controls for each in sets])
         return whole
+
+    def to(self, device: torch.device | str) -> SequenceSet:
+        """The same on another device, where batches are made then."""
+        moved = copy.copy(self)
+        moved._problems = self._problems.to(device)
+        moved._slot, moved._first = self._slot.to(device), self._first.to(device)
+        moved._controls = self._controls.to(device)
+        return moved
 
     @property
     def envelope(self) -> Envelope | None:
@@ -233,13 +256,15 @@ class SequenceSet:
 
     def batch(self, index: Tensor, generator: torch.Generator | None) -> SequenceBatch:
         """The trajectories ``index``; random symmetries and windows if a ``generator`` is given."""
-        problems, n_steps = self._problems[self._slot[index]], self._n_steps[index]
-        step = torch.arange(int(n_steps.max()))
+        device, most = self._slot.device, int(self._n_steps[index].max())
+        n_steps, index = self._n_steps[index].to(device), index.to(device)
+        problems = self._problems[self._slot[index]]
+        step = torch.arange(most, device=device)
         inside = step < n_steps[:, None]
         rows = torch.where(inside, self._first[index, None] + step, 0)
-        controls = torch.from_numpy(self._controls[rows.numpy()]) * inside[..., None]
+        controls = self._controls[rows] * inside[..., None]
         if generator:
-            mirror, reverse = (random_flags(len(index), generator) for _ in range(2))
+            mirror, reverse = (random_flags(len(index), generator).to(device) for _ in range(2))
             problems = problems.mirrored(mirror, self._table[1])
             problems = problems.reversed(reverse, self._table[0], self._dt)
             flip = controls.new_tensor(MIRROR_CONTROL[1])
@@ -251,11 +276,9 @@ class SequenceSet:
             budget = whole.constraints_to_go[:, :1].expand_as(whole.constraints_to_go)
             whole = replace(whole, constraints_to_go=budget)
         last = (n_steps - self._length).clamp(min=0)
-        share = (
-            torch.rand(len(index), generator=generator) if generator else torch.zeros(len(index))
-        )
-        first = (share * (last + 1)).long()
-        return whole.window(first, min(self._length, len(step)))
+        share = torch.rand(len(index), generator=generator) if generator else torch.zeros(1)
+        first = (share.to(device) * (last + 1)).long()
+        return whole.window(first, min(self._length, most))
 
 
 def problem_batch(dataset: PackedDataset, problems: np.ndarray) -> ProblemBatch:
