@@ -27,7 +27,7 @@ from art_policy.cli_io import (
     problem_of,
     write_plan,
 )
-from art_policy.cli_models import evaluate_models, export_model, train_model
+from art_policy.cli_models import correct_model, evaluate_models, export_model, train_model
 from freeflyer_datasets.generate import ENGINES, GenerationError
 
 DEFAULT_MODEL = "art-general"
@@ -256,6 +256,13 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument("--out", required=True, help="folder of the model")
     sub.add_argument("--model-config", help="JSON with fields of ARTConfig")
     sub.add_argument("--train-config", help="JSON with fields of TrainConfig")
+
+    sub = command("correct", correct_model, "Optimal continuations of what a model did (DAgger).")
+    sub.add_argument("model", help="an autoregressive model's name, folder, Hugging Face id")
+    sub.add_argument("dataset", help="what it was trained on, as for train")
+    sub.add_argument("--problems", type=count, default=10_000, help="how many it is let run on")
+    sub.add_argument("--workers", type=count, help="processes (default: one per processor)")
+    sub.add_argument("--out", required=True, help="folder of the new dataset, for train")
 
     sub = command("evaluate", evaluate_models, "Compare warm starts on problems never trained on.")
     sub.add_argument(

@@ -41,6 +41,26 @@ def train_model(options: argparse.Namespace) -> None:
     )
 
 
+def correct_model(options: argparse.Namespace) -> None:
+    """Collects optimal continuations of what a model did."""
+    from art_policy.corrections import collect_corrections
+    from art_policy.model import ART
+
+    data = collect_corrections(
+        ART.from_pretrained(options.model),
+        open_dataset(options.dataset),
+        options.problems,
+        options.out,
+        options.workers,
+        options.seed,
+        progress=not options.json,
+    )
+    text = f"{data.n_problems} problems in flight; now: freeflyer train {options.dataset}"
+    print_result(
+        options, {"out": options.out, "problems": data.n_problems}, f"{text} {options.out}"
+    )
+
+
 def open_dataset(name: str) -> PackedDataset:
     """The packed form of a dataset by its Minari id, or of a folder of shards or packed arrays."""
     from freeflyer_datasets import PackedDataset
