@@ -17,6 +17,7 @@ HEADS = ("multi_hypothesis", "autoregressive")
 SCENE_DESCRIPTORS = ("relative", "absolute")
 DESCRIPTORS = ("goal", "reward_to_go", "constraint_to_go", "time_to_go")
 CONSTRAINT_TO_GO = ("decremented", "constant")
+RETURNS_TO_GO = ("hindsight", "relaxed")
 MODALITIES = ("vector", "image", "lidar")
 KNOT_SPACINGS = ("uniform", "ends")
 
@@ -52,6 +53,9 @@ class ARTConfig:
             Without the last, steps are told apart by the time since the start.
         constraint_to_go: Autoregressive only: ``"decremented"`` at each violation, as in the paper
             (eq. 6), or ``"constant"``, as in its authors' code.
+        returns_to_go: Autoregressive only: the reward-to-go with which an optimal trajectory begins
+            in training: minus its own cost in ``"hindsight"``, as in the paper; ``"relaxed"``,
+            minus REL's cost, which is what generation asks for, whether or not it can be had.
         predict_time_to_go: Autoregressive only: adds the time-to-go to the loss (the paper's FT
             loss).
         envelope: Ranges of what the model was trained on; training fills it in.
@@ -73,6 +77,7 @@ class ARTConfig:
     n_modes: int = 1
     descriptors: tuple[str, ...] = DESCRIPTORS
     constraint_to_go: str = "decremented"
+    returns_to_go: str = "hindsight"
     predict_time_to_go: bool = False
     envelope: Envelope | None = None
 
@@ -82,6 +87,7 @@ class ARTConfig:
         self._require_choice("scene_descriptors", SCENE_DESCRIPTORS)
         self._require_choice("tokens_per_step", (2, 4))
         self._require_choice("constraint_to_go", CONSTRAINT_TO_GO)
+        self._require_choice("returns_to_go", RETURNS_TO_GO)
         self._require_choice("knot_spacing", KNOT_SPACINGS)
         for name, known in (("descriptors", DESCRIPTORS), ("modalities", MODALITIES)):
             object.__setattr__(self, name, tuple(getattr(self, name)))

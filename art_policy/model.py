@@ -61,11 +61,20 @@ class ART(nn.Module):
         """Where the weights are."""
         return next(self.parameters()).device
 
-    def save_pretrained(self, folder: str | Path) -> None:
-        """Writes ``model.safetensors`` and ``config.json`` into ``folder``."""
+    def save_pretrained(self, folder: str | Path, half: bool = False) -> None:
+        """Writes ``model.safetensors`` and ``config.json`` into ``folder``.
+
+        Args:
+            folder: Where to; made if needed.
+            half: Whether to write matrices as float16, half the size; they are read as float32.
+        """
         folder = Path(folder)
         folder.mkdir(parents=True, exist_ok=True)
         weights = {name: value.contiguous() for name, value in self.state_dict().items()}
+        if half:
+            weights = {
+                name: value.half() if value.dim() >= 2 else value for name, value in weights.items()
+            }
         save_file(weights, folder / WEIGHTS_NAME)
         text = json.dumps(self.config.to_dict(), indent=2)
         (folder / CONFIG_NAME).write_text(text + "\n", encoding="utf-8")

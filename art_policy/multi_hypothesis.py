@@ -93,7 +93,8 @@ class HypothesisBatch:
     ) -> HypothesisBatch:
         """Each example under a random one of the four symmetries of mirror and time reversal."""
         batch = len(self.problems)
-        mirror, reverse = random_flags(batch, generator), random_flags(batch, generator)
+        device = self.costs.device
+        mirror, reverse = (random_flags(batch, generator).to(device) for _ in range(2))
         problems = self.problems.mirrored(mirror, table[1]).reversed(reverse, table[0], dt)
         flip = self.paths.new_tensor([1.0, -1.0, -1.0])
         paths = torch.where(mirror[:, None, None, None], self.paths * flip, self.paths)
@@ -112,7 +113,8 @@ class HypothesisBatch:
         make nothing cheaper. Other optima that the discs do touch are dropped.
         """
         discs, added = self.problems.discs, random_discs(self.problems, table, generator)
-        share = torch.linspace(0.0, 1.0, self.paths.shape[2])[::2]
+        device = discs.device
+        share = torch.linspace(0.0, 1.0, self.paths.shape[2], device=device)[::2]
         way = self.problems.goal - self.problems.start
         line = self.problems.start[:, None, :2] + share[:, None] * way[:, None, :2]
         positions = line[:, None] + self.paths[:, :, ::2, :2]  # (B, R, S / 2, 2)
@@ -120,9 +122,8 @@ class HypothesisBatch:
         centres = added[:, None, :, :2] + times[..., None, None] * added[:, None, :, 3:]
         gaps = (positions[:, :, :, None] - centres[:, None]).norm(dim=4).amin(2)  # (B, R, M)
         near = gaps < added[:, None, :, 2] + _DECOY_MARGIN
-        wanted = torch.rand(discs.shape[:2], generator=generator) < torch.rand(
-            len(discs), 1, generator=generator
-        )
+        draw = torch.rand(discs.shape[:2], generator=generator)
+        wanted = (draw < torch.rand(len(discs), 1, generator=generator)).to(device)
         present = self.problems.present
         placed = wanted & ~near[:, 0] & ~present  # (B, M)
         placed &= placed.cumsum(1) + present.sum(1, keepdim=True) <= most

@@ -184,7 +184,8 @@ def random_discs(
     moving = torch.rand(shape[0], 1, generator=generator) < _MOVING_SHARE
     speed, course = DISC_SPEED * draw[..., 3] * moving, 2.0 * math.pi * draw[..., 4]
     keep_out = (radius + scenario.robot.radius) * scenario.keep_out_factor
-    return torch.stack([x, y, keep_out, speed * course.cos(), speed * course.sin()], dim=2)
+    rows = torch.stack([x, y, keep_out, speed * course.cos(), speed * course.sin()], dim=2)
+    return rows.to(problems.discs.device)
 
 
 @dataclass(frozen=True, eq=False)

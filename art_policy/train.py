@@ -339,19 +339,23 @@ def _examples(
     splits = [dataset.split(config.validation_fraction) for dataset in datasets]
     pairs = list(zip(datasets, splits))
     if model.head == "autoregressive":
-        constant = model.constraint_to_go == "constant"
-        settings = (model.table, model.context_length, constant, config.max_optima)
+        settings: Any = {
+            "constant_budget": model.constraint_to_go == "constant",
+            "max_optima": config.max_optima,
+            "relaxed_returns": model.returns_to_go == "relaxed",
+        }
+        size = model.table, model.context_length
         training, validation = (
-            SequenceSet.joined([SequenceSet(d, s[side], *settings) for d, s in pairs])
+            SequenceSet.joined([SequenceSet(d, s[side], *size, **settings) for d, s in pairs])
             for side in range(2)
         )
         return training, validation
     most = config.max_discs if config.augment else None
 
     def hypotheses(side: int, tails: float, max_discs: int | None) -> HypothesisSet:
-        settings: Any = {"tails": tails, "max_discs": max_discs, "max_optima": config.max_optima}
+        limits: Any = {"tails": tails, "max_discs": max_discs, "max_optima": config.max_optima}
         return HypothesisSet.joined(
-            [HypothesisSet(d, s[side], model.table, **settings) for d, s in pairs]
+            [HypothesisSet(d, s[side], model.table, **limits) for d, s in pairs]
         )
 
     return hypotheses(0, config.tails, most), hypotheses(1, 0.0, None)

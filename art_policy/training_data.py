@@ -198,6 +198,8 @@ class SequenceSet:
         length: Number of steps of a window, the model's context length.
         constant_budget: Whether the constraint-to-go stays what it is for the whole trajectory.
         max_optima: Most optima of one problem that are used, cheapest first.
+        relaxed_returns: Whether the reward-to-go of optimal trajectories begins at minus REL's cost
+            rather than their own.
     """
 
     def __init__(
@@ -208,6 +210,7 @@ class SequenceSet:
         length: int,
         constant_budget: bool = False,
         max_optima: int = 4,
+        relaxed_returns: bool = False,
     ) -> None:
         kept = np.asarray(dataset.rank)[trajectories] < max_optima
         trajectories = trajectories[kept]
@@ -216,6 +219,9 @@ class SequenceSet:
         self._slot = torch.from_numpy(slot)
         self._first = torch.from_numpy(dataset.offsets[trajectories])
         self._n_steps = torch.from_numpy(np.diff(dataset.offsets)[trajectories])
+        above = dataset.cost[trajectories] - dataset.rel_cost[problems][slot]
+        self._above_rel = torch.from_numpy(np.maximum(above, 0.0).astype(np.float32))
+        self._above_rel *= relaxed_returns
         with warnings.catch_warnings():
             # The file is mapped read-only, and nothing here writes.
             warnings.filterwarnings("ignore", message="The given NumPy array is not writable")
@@ -235,6 +241,7 @@ class SequenceSet:
         whole._slot = torch.cat([each._slot + n for each, n in zip(sets, problems)])
         whole._first = torch.cat([each._first + n for each, n in zip(sets, steps)])
         whole._n_steps = torch.cat([each._n_steps for each in sets])
+        whole._above_rel = torch.cat([each._above_rel for each in sets])
         whole._controls = torch.cat([each._controls for each in sets])
         return whole
 
@@ -243,6 +250,7 @@ class SequenceSet:
         moved = copy.copy(self)
         moved._problems = self._problems.to(device)
         moved._slot, moved._first = self._slot.to(device), self._first.to(device)
+        moved._above_rel = self._above_rel.to(device)
         moved._controls = self._controls.to(device)
         return moved
 
@@ -272,6 +280,9 @@ class SequenceSet:
             flipped = reverse_controls(controls, n_steps)
             controls = torch.where(reverse[:, None, None], flipped, controls)
         whole = SequenceBatch.from_controls(problems, controls, n_steps, self._dt, self._robot)
+        # What generation asks for, less what has been spent: never more than nothing.
+        returns = (whole.returns_to_go + self._above_rel[index, None]).clamp(max=0.0)
+        whole = replace(whole, returns_to_go=returns)
         if self._constant_budget:
             budget = whole.constraints_to_go[:, :1].expand_as(whole.constraints_to_go)
             whole = replace(whole, constraints_to_go=budget)

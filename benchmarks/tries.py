@@ -16,13 +16,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import joblib
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from art_policy.cli_models import open_dataset
 from art_policy.evaluation import evaluation_problems
-from art_policy.evaluation.protocol import evaluate_problem
+from art_policy.evaluation.protocol import ProblemRecord, evaluate_problem
 from art_policy.evaluation.statistics import finite, summarise
 from art_policy.layers import ARTConfig, Block, Decoder, Encoder, initialise
 from art_policy.model import ART
@@ -39,29 +40,34 @@ from art_policy.train import train
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import LOG_NAME
 from freeflyer_datasets import PackedDataset
+from freeflyer_env.scenario import Problem
+
+#: The base variant: its model, and number of problems. It is half the size of the shipped models.
+BASE, _BASE = ARTConfig(width=128, n_heads=4), 20_000
 
 #: Name, problems, changes of the model, changes of the loss, changes of the training.
 VARIANTS: list[tuple[str, int, dict[str, Any], dict[str, Any], dict[str, Any]]] = [
-    ("base: 30,000 problems, 6 hypotheses, 40 knots, width 192", 30_000, {}, {}, {}),
-    ("3,000 problems", 3_000, {}, {}, {}),
+    ("base: 20,000 problems, 6 hypotheses, 40 knots, width 128", _BASE, {}, {}, {}),
+    ("2,500 problems", 2_500, {}, {}, {}),
+    ("5,000 problems", 5_000, {}, {}, {}),
     ("10,000 problems", 10_000, {}, {}, {}),
-    ("100,000 problems", 100_000, {}, {}, {}),
-    ("1 hypothesis", 30_000, {"n_hypotheses": 1}, {}, {}),
-    ("3 hypotheses", 30_000, {"n_hypotheses": 3}, {}, {}),
-    ("12 hypotheses", 30_000, {"n_hypotheses": 12}, {}, {}),
-    ("20 knots", 30_000, {"n_knots": 20}, {}, {}),
-    ("20 knots, equally spaced", 30_000, {"n_knots": 20, "knot_spacing": "uniform"}, {}, {}),
-    ("width 96", 30_000, {"width": 96}, {}, {}),
-    ("width 288", 30_000, {"width": 288}, {}, {}),
-    ("the cheapest optimum alone as label", 30_000, {}, {"others_weight": 0.0}, {}),
-    ("all optima count the same", 30_000, {}, {"others_weight": 1.0}, {}),
-    ("no pull on idle hypotheses", 30_000, {}, {"idle_weight": 0.0}, {}),
-    ("sharper scores", 30_000, {}, {"cost_temperature": 0.005}, {}),
-    ("no symmetries", 30_000, {}, {}, {"augment": False}),
-    ("a fourth of the examples begins in flight", 30_000, {}, {}, {"tails": 0.25}),
-    ("discs added where they change no optimum", 30_000, {}, {}, {"max_discs": 8}),
+    ("1 hypothesis", _BASE, {"n_hypotheses": 1}, {}, {}),
+    ("3 hypotheses", _BASE, {"n_hypotheses": 3}, {}, {}),
+    ("12 hypotheses", _BASE, {"n_hypotheses": 12}, {}, {}),
+    ("20 knots", _BASE, {"n_knots": 20}, {}, {}),
+    ("20 knots, equally spaced", _BASE, {"n_knots": 20, "knot_spacing": "uniform"}, {}, {}),
+    ("width 64", _BASE, {"width": 64}, {}, {}),
+    ("width 256", _BASE, {"width": 256}, {}, {"learning_rate": 7e-4}),
+    ("2 layers", _BASE, {"n_layers": 2}, {}, {}),
+    ("the cheapest optimum alone as label", _BASE, {}, {}, {"max_optima": 1}),
+    ("all optima count the same", _BASE, {}, {"others_weight": 1.0}, {}),
+    ("no pull on idle hypotheses", _BASE, {}, {"idle_weight": 0.0}, {}),
+    ("sharper scores", _BASE, {}, {"cost_temperature": 0.005}, {}),
+    ("no symmetries", _BASE, {}, {}, {"augment": False}),
+    ("a fourth of the examples begins in flight", _BASE, {}, {}, {"tails": 0.25}),
+    ("discs added where they change no optimum", _BASE, {}, {}, {"max_discs": 8}),
 ]
-FLOW = "flow matching, 8 steps"
+FLOW, FLOW_NAME = "flow matching, 8 steps", "flow.pt"
 
 
 class FlowMatching(nn.Module):
@@ -105,7 +111,8 @@ class FlowMatching(nn.Module):
             dim=1,
         )
         # Samples of one problem must not see one another.
-        mask = torch.ones(tokens.shape[1], tokens.shape[1], dtype=torch.bool)
+        length = tokens.shape[1]
+        mask = torch.ones(length, length, dtype=torch.bool, device=tokens.device)
         mask[:size, :size] = torch.eye(size, dtype=torch.bool)
         mask[size:, :size] = False
         for block in self.blocks:
@@ -115,10 +122,11 @@ class FlowMatching(nn.Module):
     def loss(self, batch: HypothesisBatch, generator: torch.Generator) -> Tensor:
         """Squared error of the velocity along the straight way from noise to the best optimum."""
         matrix = interpolation_matrix(self.config.n_knots, batch.paths.shape[2])
-        target = torch.linalg.lstsq(matrix.expand(len(batch), -1, -1), batch.paths[:, 0]).solution
+        inverse = torch.linalg.pinv(matrix).to(self.device)  # (n_knots, S)
+        target = torch.einsum("ks,bsc->bkc", inverse, batch.paths[:, 0])
         target = (target / self.scale)[:, None].expand(-1, 4, -1, -1)
-        noise = torch.randn(target.shape, generator=generator)
-        time = torch.rand(target.shape[:2], generator=generator)
+        noise = torch.randn(target.shape, generator=generator).to(self.device)
+        time = torch.rand(target.shape[:2], generator=generator).to(self.device)
         paths = noise + time[..., None, None] * (target - noise)
         return (self.velocity(batch.problems, paths, time) - (target - noise)).square().mean()
 
@@ -131,16 +139,17 @@ class FlowMatching(nn.Module):
         return paths * self.scale, torch.zeros(paths.shape[:2])
 
 
-def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> FlowMatching:
-    """Trains the baseline on the first 30,000 problems."""
+def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> None:
+    """Trains the baseline on as many problems as the base variant."""
     from art_policy.training_data import HypothesisSet
 
-    torch.manual_seed(0)
-    model, path = FlowMatching(ARTConfig()), folder / "flow.pt"
+    path = folder / FLOW_NAME
     if path.is_file():
-        model.load_state_dict(torch.load(path, weights_only=True))
-        return model.eval()
-    training = HypothesisSet(data, first_problems(data, 30_000), model.config.table)
+        return
+    torch.manual_seed(0)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = FlowMatching(BASE).to(device)
+    training = HypothesisSet(data, first_problems(data, _BASE), model.config.table).to(device)
     assert config.max_steps
     optimizer = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=0.05)
     average = [p.detach().clone() for p in model.parameters()]
@@ -149,7 +158,7 @@ def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> FlowMa
         for group in optimizer.param_groups:
             group["lr"] = config.rate(step / config.max_steps)
         index = torch.randint(len(training), (config.batch_size,), generator=generator)
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast(device, torch.bfloat16, enabled=device == "cuda"):
             loss = model.loss(training.batch(index, generator), generator)
         loss.backward()
         torch.nn.utils.clip_grad_norm_(model.parameters(), 1.0)
@@ -159,7 +168,14 @@ def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> FlowMa
     with torch.no_grad():
         for parameter, value in zip(model.parameters(), average):
             parameter.copy_(value)
-    torch.save(model.state_dict(), path)
+    folder.mkdir(parents=True, exist_ok=True)
+    torch.save(model.cpu().state_dict(), path)
+
+
+def load_flow(folder: Path) -> FlowMatching:
+    """The trained baseline."""
+    model = FlowMatching(BASE)
+    model.load_state_dict(torch.load(folder / FLOW_NAME, weights_only=True))
     return model.eval()
 
 
@@ -187,13 +203,31 @@ def first(data: PackedDataset, count: int) -> PackedDataset:
     return part
 
 
-def train_variant(data: PackedDataset, index: int, config: TrainConfig, folder: Path) -> ART:
-    """Trains one variant, or opens it if it is there."""
+def variant_folder(folder: Path, index: int) -> Path:
+    """Where a variant lies."""
+    return folder / f"variant-{index:02d}"
+
+
+def train_variant(data: PackedDataset, index: int, config: TrainConfig, folder: Path) -> None:
+    """Trains one variant, unless it is there."""
     _, count, model, loss, changes = VARIANTS[index]
-    out = folder / f"variant-{index:02d}"
     config = dataclasses.replace(config, **changes)
     MultiHypothesis.loss.__defaults__ = (HypothesisLoss(**loss),)
-    return train(first(data, count), dataclasses.replace(ARTConfig(), **model), config, out)
+    model_config = dataclasses.replace(BASE, **model)
+    train(first(data, count), model_config, config, variant_folder(folder, index))
+
+
+def evaluate_some(
+    folder: Path, variants: list[int], problems: list[tuple[str, int, Problem]], n_starts: int
+) -> list[ProblemRecord]:
+    """All methods on some problems, in a worker."""
+    torch.set_num_threads(1)
+    models: dict[str, Any] = {
+        VARIANTS[i][0]: ART.from_pretrained(variant_folder(folder, i)) for i in variants
+    }
+    if (folder / FLOW_NAME).is_file():
+        models[FLOW] = load_flow(folder)
+    return [evaluate_problem(models, *problem, 4, n_starts) for problem in problems]
 
 
 def last_validation(folder: Path) -> dict[str, float]:
@@ -207,42 +241,49 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("dataset")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=1250)
+    parser.add_argument("--steps", type=int, default=1500)
     parser.add_argument("--problems", type=int, default=300, help="of each kind")
     parser.add_argument("--variants", type=int, nargs="+", default=list(range(len(VARIANTS))))
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--starts", type=int, default=13, help="starts for the best known solution")
+    parser.add_argument("--workers", type=int, default=-1, help="processes of the evaluation")
+    parser.add_argument("--only-train", action="store_true", help="leave the evaluation for later")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     data = open_dataset(options.dataset)
     config = TrainConfig(
-        max_steps=options.steps, threads=options.threads, tails=0.0, ema_decay=0.995
+        max_steps=options.steps,
+        threads=options.threads,
+        tails=0.0,
+        ema_decay=0.995,
+        solve_problems=0,
+        validate_every=options.steps,
     )
-    models: dict[str, Any] = {}
-    rows: dict[str, dict[str, Any]] = {}
     for index in options.variants:
-        name = VARIANTS[index][0]
-        models[name] = train_variant(data, index, config, options.out)
-        figures = last_validation(options.out / f"variant-{index:02d}")
-        rows[name] = {
-            key: figures.get(f"val_{key}", math.nan)
-            for key in ("distance", "chosen_distance", "agreement", "regret")
-        }
-        print(f"trained: {name} {rows[name]}", flush=True)
-    models[FLOW] = train_flow(data, config, options.out)
-    rows[FLOW] = {}
-    torch.set_num_threads(1)
+        train_variant(data, index, config, options.out)
+        print(f"trained: {VARIANTS[index][0]}", flush=True)
+    if 0 in options.variants:
+        train_flow(data, config, options.out)
+    if options.only_train:
+        return
+    rows: dict[str, dict[str, Any]] = {
+        VARIANTS[i][0]: last_validation(variant_folder(options.out, i)) for i in options.variants
+    }
+    names = [*rows, FLOW] if (options.out / FLOW_NAME).is_file() else list(rows)
     for scenes in ("held-out", "random"):
-        records = []
-        for scene, number, problem in evaluation_problems(options.problems, scenes, seed=3):
-            records.append(evaluate_problem(models, scene, number, problem, 4, 13))
-        groups = summarise(records)
-        for name in models:
-            four = f"{name}, best of {min(4, models[name].config.n_hypotheses)}"
-            four = four if four in groups else name
-            for kind, key in (("first", name), ("best of 4", four)):
-                rows[name][f"{scenes}, {kind}"] = groups[key]
-        rows.setdefault("best known", {})[f"{scenes}, first"] = groups["best known"]
-        rows.setdefault("REL", {})[f"{scenes}, first"] = groups["REL"]
+        problems = list(evaluation_problems(options.problems, scenes, seed=3))
+        parts = [problems[i : i + 5] for i in range(0, len(problems), 5)]
+        run = joblib.delayed(evaluate_some)
+        jobs = (run(options.out, options.variants, part, options.starts) for part in parts)
+        with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
+            found = joblib.Parallel(n_jobs=options.workers)(jobs)
+        groups = summarise([record for part in found for record in part])
+        for name in names:
+            four = max((g for g in groups if g.startswith(f"{name}, best of")), default=name)
+            row = rows.setdefault(name, {})
+            row[f"{scenes}, first"], row[f"{scenes}, best of 4"] = groups[name], groups[four]
+        for name in ("REL", "best known"):
+            rows.setdefault(name, {})[f"{scenes}, first"] = groups[name]
     content = {"steps": options.steps, "problems": options.problems, "variants": rows}
     content["made"] = time.strftime("%Y-%m-%d")
     path = options.out / "tries.json"
@@ -258,7 +299,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
         "|---|---|---|---|---|---|---|",
     ]
     for name, row in rows.items():
-        cells = [name, f"{1e3 * row.get('chosen_distance', math.nan):.0f} mm"]
+        cells = [name, f"{1e3 * row.get('val_chosen_distance', math.nan):.0f} mm"]
         for scenes in ("held-out", "random"):
             one = row[f"{scenes}, first"]
             four = row.get(f"{scenes}, best of 4", one)
