@@ -43,11 +43,14 @@ def train_model(options: argparse.Namespace) -> None:
 
 def correct_model(options: argparse.Namespace) -> None:
     """Collects optimal continuations of what a model did."""
+    import torch
+
     from art_policy.corrections import collect_corrections
     from art_policy.model import ART
 
+    device = "cuda" if torch.cuda.is_available() else "cpu"
     data = collect_corrections(
-        ART.from_pretrained(options.model),
+        ART.from_pretrained(options.model, device),
         open_dataset(options.dataset),
         options.problems,
         options.out,

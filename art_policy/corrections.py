@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _SHORTEST = 10  # steps that are left at least
-_BATCH, _CHUNK = 512, 32  # problems that are generated at once, that a process solves at once
+_BATCH = {"cpu": 256, "cuda": 4096}  # problems that are generated at once
+_CHUNK = 32  # that a process solves at once
 
 
 def collect_corrections(
@@ -110,8 +111,9 @@ _Correction = tuple[Problem, Trajectory, Trajectory]
 def _departures(
     model: ART, data: PackedDataset, rows: np.ndarray, rng: np.random.Generator
 ) -> Iterator[_Departure]:
-    for first in range(0, len(rows), _BATCH):
-        part = rows[first : first + _BATCH]
+    size = _BATCH.get(model.device.type, 256)
+    for first in range(0, len(rows), size):
+        part = rows[first : first + size]
         numbers = np.asarray(data.problem_index)[part]
         problems = [data.problem(int(number)) for number in numbers]
         runs = generate(model, problems, -np.asarray(data.rel_cost)[numbers])
