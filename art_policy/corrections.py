@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 _SHORTEST = 10  # steps that are left at least
-_BATCH = {"cpu": 256, "cuda": 4096}  # problems that are generated at once
+_BATCH = {"cpu": 256, "cuda": 2048}  # problems that are generated at once
 _CHUNK = 32  # that a process solves at once
 
 

@@ -209,7 +209,9 @@ def variant_folder(folder: Path, index: int) -> Path:
 
 
 def train_variant(data: PackedDataset, index: int, config: TrainConfig, folder: Path) -> None:
-    """Trains one variant, unless it is there."""
+    """Trains one variant, unless its card, which is written last, is there."""
+    if (variant_folder(folder, index) / "README.md").is_file():
+        return
     _, count, model, loss, changes = VARIANTS[index]
     config = dataclasses.replace(config, **changes)
     MultiHypothesis.loss.__defaults__ = (HypothesisLoss(**loss),)

@@ -266,3 +266,24 @@ def test_padding_obstacles_stay_padding(dataset: PackedDataset) -> None:
     image = batch.mirrored(which, WIDTH).reversed(~which, LENGTH)
     assert torch.equal(batch.present, image.present)
     assert not batch.present.all()
+
+
+def test_relaxed_returns_begin_at_the_cost_of_rel(dataset: PackedDataset) -> None:
+    rows = np.arange(len(dataset))
+    hindsight = SequenceSet(dataset, rows, (LENGTH, WIDTH), 200)
+    relaxed = SequenceSet(dataset, rows, (LENGTH, WIDTH), 200, relaxed_returns=True)
+    index = torch.arange(len(hindsight))
+    own, asked = (each.batch(index, None) for each in (hindsight, relaxed))
+    rel_cost = torch.tensor(dataset.rel_cost[dataset.problem_index[rows]], dtype=torch.float32)
+    torch.testing.assert_close(asked.returns_to_go[:, 0], -rel_cost, atol=1e-5, rtol=0.0)
+    assert (asked.returns_to_go >= own.returns_to_go - 1e-6).all()
+    assert (asked.returns_to_go <= 0.0).all()
+    spent = asked.controls[:, 0].abs().sum(1)
+    expected = (asked.returns_to_go[:, 0] + spent).clamp(max=0.0)
+    torch.testing.assert_close(asked.returns_to_go[:, 1], expected, atol=1e-5, rtol=0.0)
+
+
+def test_only_the_cheapest_optima_are_used(dataset: PackedDataset) -> None:
+    rows = np.arange(len(dataset))
+    best = SequenceSet(dataset, rows, (LENGTH, WIDTH), 200, max_optima=1)
+    assert len(best) == (np.asarray(dataset.rank) == 0).sum() < len(rows)
