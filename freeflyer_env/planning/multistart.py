@@ -113,8 +113,9 @@ def race_scp(
 
     A subproblem's cost is close to that of the solution it leads to, so one subproblem is solved
     from each warm start, and the cheapest is refined first; another is refined until its cost is
-    above the best solution's by so much that it will hardly fall below. It takes about half the
-    time of refining all and loses little: the cheapest optimum is missed where the cost falls late.
+    above the best solution's by so much that it will hardly fall below, or its path is the best
+    solution's. It takes about half the time of refining all, a third where several warm starts lead
+    to the same optimum, and loses little: the cheapest is missed where the cost falls late.
 
     Args:
         problem: What to solve.
@@ -137,16 +138,30 @@ def race_scp(
         if isinstance(loop, SCPLoop):
             loop.step()
     runners = [loop for loop in loops if isinstance(loop, SCPLoop)]
-    best = np.inf
+    best: SCPLoop | None = None
     for loop in sorted(runners, key=lambda loop: loop.cost):
         while not loop.done:
-            if loop.cost > _BEHIND[min(loop.iterations, 2) - 1] * best:
+            if best is not None and _is_beaten(loop, best):
                 loop.give_up()
             else:
                 loop.step()
-        if loop.solved:
-            best = min(best, loop.cost)
+        if loop.solved and (best is None or loop.cost < best.cost):
+            best = loop
     return tuple(loop.result() if isinstance(loop, SCPLoop) else loop for loop in loops)
+
+
+def _is_beaten(loop: SCPLoop, best: SCPLoop) -> bool:
+    """Whether a loop will hardly lead to anything cheaper than the best one did."""
+    if loop.cost > _BEHIND[min(loop.iterations, 2) - 1] * best.cost:
+        return True
+    assert loop.trajectory is not None
+    assert best.trajectory is not None
+    return _apart(loop.trajectory, best.trajectory) < _SAME_POSITION
+
+
+def _apart(first: Trajectory, second: Trajectory) -> float:
+    """Largest distance of two trajectories' nodes along either axis in m."""
+    return float(np.abs(first.states[:, :2] - second.states[:, :2]).max())
 
 
 def distinct_optima(results: tuple[SCPResult, ...]) -> tuple[SCPResult, ...]:
@@ -163,5 +178,4 @@ def _same(first: SCPResult, second: SCPResult) -> bool:
         return False
     assert first.trajectory is not None
     assert second.trajectory is not None
-    gap = first.trajectory.states[:, :2] - second.trajectory.states[:, :2]
-    return bool(np.abs(gap).max() < _SAME_POSITION)
+    return _apart(first.trajectory, second.trajectory) < _SAME_POSITION

@@ -337,6 +337,11 @@ class SCPLoop:
         """Cost of the last iterate in m/s, infinite before the first."""
         return self._costs[-1] if self._costs else np.inf
 
+    @property
+    def trajectory(self) -> Trajectory | None:
+        """The last iterate, None before the first."""
+        return self._trajectory
+
     def give_up(self) -> None:
         """Ends the loop because another warm start has led to a cheaper solution."""
         self._status = SCPStatus.OUTRUN
