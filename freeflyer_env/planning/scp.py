@@ -343,7 +343,7 @@ class SCPLoop:
         return self._trajectory
 
     def give_up(self) -> None:
-        """Ends the loop because another warm start has led to a cheaper solution."""
+        """Ends the loop: another warm start has led to a cheaper solution, or to the same."""
         self._status = SCPStatus.OUTRUN
 
     def step(self) -> None:
