@@ -54,7 +54,7 @@ _REMEDIES = {
     SCPStatus.TIME_LIMIT: (
         "Stopped at SCPConfig.time_limit; raise it, or use the trajectory if it is feasible."
     ),
-    SCPStatus.OUTRUN: "Given up because another warm start had led to a cheaper solution, or to the same.",
+    SCPStatus.OUTRUN: "Given up: another warm start had led to a cheaper solution, or to the same.",
     SCPStatus.NUMERICAL_FAILURE: (
         "The solver gave up on a subproblem; try another warm start or another backend."
     ),
