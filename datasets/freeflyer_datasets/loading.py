@@ -232,10 +232,11 @@ class PackedDataset:
         # (`take` is four times as fast as an array of indices in brackets.)
         position = self.offsets[rows] + np.minimum(ahead, n_steps - 1)
         controls = np.asarray(self.controls).take(position.ravel(), axis=0).reshape(length, -1)
-        controls *= np.repeat(inside, 3, axis=1)
+        exists = np.repeat(inside, 3, axis=1)
+        controls *= exists
         rates = controls[:-1] * np.tile(self.robot.control_gain, len(rows))
         # A last impulse is not followed by a drift, so that pose and rates are those of the end.
-        poses = np.repeat(np.where(ahead[:-1] < n_steps - 1, self.dt, 0.0), 3, axis=1)
+        poses = exists[1:] * self.dt
         state = self._states_at(rows, begin)
         pose, rate = state[:, :3].ravel(), state[:, 3:].ravel()
         for rates_after, poses_after in zip(rates, poses):
