@@ -12,6 +12,7 @@ import torch
 from art_policy.generation import SteppedModel, generate
 from art_policy.multi_hypothesis import interpolation_matrix
 from art_policy.sequence import ProblemBatch
+from freeflyer_env.constraints import keep_out_depth
 from freeflyer_env.planning.homotopy import push_out
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
@@ -28,9 +29,9 @@ class Proposal:
 
     Attributes:
         trajectory: The warm start; it has the problem's number of steps.
-        score: The model's opinion, higher is better: the log-probability of leading to the best
-            optimum (multi-hypothesis), or minus violating nodes and miss of the goal
-            (autoregressive).
+        score: Higher is better: the log-probability, in the model's opinion, of leading to the best
+            optimum (multi-hypothesis), or minus the number of nodes inside keep-out discs and the
+            cost in m/s (autoregressive).
     """
 
     trajectory: Trajectory
@@ -122,28 +123,38 @@ def decode_poses(problem: Problem, knots: FloatArray, spacing: str = "ends") -> 
     return poses
 
 
-#: Candidates of an autoregressive model ask for REL's cost times 1, 1.05, 1.1 ...: REL's cost is a
-#: lower bound, which the obstacles may put out of reach. Those after the first are sampled if the
-#: model has several modes.
+#: Candidates of an autoregressive model with one mode ask for REL's cost times 1, 1.05, 1.1 ...:
+#: REL's cost is a lower bound, which the obstacles may put out of reach.
 _COST_STEP = 0.05
+
+#: One with several modes is sampled at least so often, and asks for REL's cost each time: the first
+#: impulse decides on which side the obstacles are passed, and which samples pass them is seen at
+#: once.
+_N_SAMPLES = 8
+
+#: A node so deep in a keep-out disc (m) counts as inside.
+_INSIDE = 1e-3
 
 
 def _sequences(
     model: SteppedModel, problems: Sequence[Problem], n_candidates: int, rel_costs: Sequence[float]
 ) -> list[list[Proposal]]:
-    factors = 1.0 + _COST_STEP * np.arange(n_candidates)
+    several = model.config.n_modes > 1
+    count = max(n_candidates, _N_SAMPLES) if several else n_candidates
+    factors = np.ones(count) if several else 1.0 + _COST_STEP * np.arange(count)
     tasks = [problem for problem in problems for _ in factors]
     returns = -np.outer(rel_costs, factors).ravel()
-    draws = list(range(n_candidates)) * len(problems)
+    draws = list(range(count)) * len(problems)
     proposals = [
-        _judge(problem, Trajectory.from_controls(problem, controls))
+        _judge(problem, Trajectory.from_controls(problem, controls).landed(problem))
         for problem, controls in zip(tasks, generate(model, tasks, returns, draws=draws))
     ]
-    groups = [proposals[i : i + n_candidates] for i in range(0, len(proposals), n_candidates)]
-    return [sorted(group, key=lambda proposal: -proposal.score) for group in groups]
+    groups = [proposals[i : i + count] for i in range(0, len(proposals), count)]
+    return [sorted(group, key=lambda p: -p.score)[:n_candidates] for group in groups]
 
 
 def _judge(problem: Problem, trajectory: Trajectory) -> Proposal:
-    """Scores a generated trajectory by its violating nodes and its miss of the goal."""
-    miss = np.linalg.norm(trajectory.states[-1, :2] - problem.goal[:2])
-    return Proposal(trajectory, -float(trajectory.violations(problem).sum() + 10.0 * miss))
+    """Scores a generated trajectory by its nodes inside keep-out discs, then by its cost."""
+    nodes, times = trajectory.states[:-1, :2], problem.node_times[:-1]
+    inside = (keep_out_depth(problem.scenario, nodes, times) > _INSIDE).sum()
+    return Proposal(trajectory, -float(inside + min(trajectory.cost, 1.0)))

@@ -345,11 +345,12 @@ def _examples(
             "relaxed_returns": model.returns_to_go == "relaxed",
         }
         size = model.table, model.context_length
-        training, validation = (
-            SequenceSet.joined([SequenceSet(d, s[side], *size, **settings) for d, s in pairs])
-            for side in range(2)
-        )
-        return training, validation
+
+        def sequences(side: int, openings: float) -> SequenceSet:
+            sets = [SequenceSet(d, s[side], *size, **settings, openings=openings) for d, s in pairs]
+            return SequenceSet.joined(sets)
+
+        return sequences(0, config.openings), sequences(1, 0.0)
     most = config.max_discs if config.augment else None
 
     def hypotheses(side: int, tails: float, max_discs: int | None) -> HypothesisSet:
@@ -364,12 +365,15 @@ def _examples(
 def _initialise(model: ART, name: str) -> None:
     """Begins with the weights of another model.
 
-    More hypotheses than it has begin anew; other knots begin where its own put them.
+    More hypotheses than it has begin anew; other knots begin where its own put them. Several modes
+    begin as one that had none, but for what is drawn, and grow apart.
     """
     other = ART.from_pretrained(name)
     ours, theirs = model.config.to_dict(), other.config.to_dict()
     changed = [key for key in ours if ours[key] != theirs[key]]
-    free = {"n_hypotheses", "n_knots", "knot_spacing", "dropout", "envelope"}
+    free = {"n_hypotheses", "n_knots", "knot_spacing", "dropout", "envelope", "returns_to_go"}
+    if other.config.n_modes == 1:
+        free.add("n_modes")
     if changed := sorted(set(changed) - free):
         raise ValueError(
             f"TrainConfig.init: {name!r} is of another {', '.join(changed)} than the model that is "
@@ -386,6 +390,12 @@ def _initialise(model: ART, name: str) -> None:
         for name in ("net.knot_decoder.linear.weight", "net.knot_decoder.linear.bias"):
             by_knot = weights[name].unflatten(0, (-1, 3))  # (n_knots, 3, ...)
             weights[name] = torch.einsum("ij,j...->i...", values, by_knot).flatten(0, 1)
+    elif model.config.n_modes > other.config.n_modes:
+        drawn = model.state_dict()
+        for name in ("net.control_decoder.linear.weight", "net.control_decoder.linear.bias"):
+            repeats = (model.config.n_modes,) + (1,) * (weights[name].dim() - 1)
+            weights[name] = drawn[name] + weights[name].repeat(repeats)
+        weights |= {name: drawn[name] for name in drawn if name.startswith("net.mode_decoder.")}
     model.load_state_dict(weights)
 
 

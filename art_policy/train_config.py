@@ -26,6 +26,9 @@ class TrainConfig:
         max_optima: Most optima of one problem that are learned from, cheapest first.
         tails: Multi-hypothesis only: share of the problems of which one is added that begins in
             flight, for re-planning.
+        openings: Autoregressive only: share of the batches that hold only the first 16 steps of
+            their trajectories. There the way is chosen, nearly all of the error is made, and a
+            batch costs a fifth.
         max_discs: Multi-hypothesis only: if given, augmentation adds discs to a scene, until it has
             at most so many, where they leave the best optimum what it is.
         init: Model whose weights training begins with, as :meth:`ART.from_pretrained` takes it;
@@ -55,6 +58,7 @@ class TrainConfig:
     augment: bool = True
     max_optima: int = 4
     tails: float = 0.25
+    openings: float = 0.0
     max_discs: int | None = None
     init: str | None = None
     validation_fraction: float = 0.05

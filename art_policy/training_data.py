@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _LABEL_SCP = 1
 _CHUNK = 4096  # trajectories that are rolled out at once
+_OPENING = 16  # steps
 
 
 class HypothesisSet:
@@ -200,6 +201,7 @@ class SequenceSet:
         max_optima: Most optima of one problem that are used, cheapest first.
         relaxed_returns: Whether the reward-to-go of optimal trajectories begins at minus REL's cost
             rather than their own.
+        openings: Share of the batches that hold only the first steps of their trajectories.
     """
 
     def __init__(
@@ -211,6 +213,7 @@ class SequenceSet:
         constant_budget: bool = False,
         max_optima: int = 4,
         relaxed_returns: bool = False,
+        openings: float = 0.0,
     ) -> None:
         kept = np.asarray(dataset.rank)[trajectories] < max_optima
         trajectories = trajectories[kept]
@@ -228,6 +231,7 @@ class SequenceSet:
             self._controls = torch.from_numpy(np.asarray(dataset.controls))
         self._dt, self._robot = dataset.dt, dataset.robot
         self._table, self._length, self._constant_budget = table, length, constant_budget
+        self._openings = openings
 
     @classmethod
     def joined(cls, sets: Sequence[SequenceSet]) -> SequenceSet:
@@ -286,6 +290,8 @@ class SequenceSet:
         if self._constant_budget:
             budget = whole.constraints_to_go[:, :1].expand_as(whole.constraints_to_go)
             whole = replace(whole, constraints_to_go=budget)
+        if generator and float(torch.rand(1, generator=generator)) < self._openings:
+            return whole.window(torch.zeros_like(n_steps), min(_OPENING, self._length, most))
         last = (n_steps - self._length).clamp(min=0)
         share = torch.rand(len(index), generator=generator) if generator else torch.zeros(1)
         first = (share.to(device) * (last + 1)).long()

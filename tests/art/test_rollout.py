@@ -14,7 +14,7 @@ from art_policy.model import ART
 from art_policy.rollout import decode_poses, propose, propose_batch
 from freeflyer_env import Obstacles, Problem, Scenario, dynamics, sample_problem
 from freeflyer_env.constraints import actuation_excess, keep_out_depth
-from freeflyer_env.planning import solve_rel, solve_scp
+from freeflyer_env.planning import Trajectory, solve_rel, solve_scp
 
 MULTI = ARTConfig(width=32, n_layers=1, n_heads=2, n_hypotheses=4)
 SEQUENCE = replace(MULTI, head="autoregressive", context_length=8)
@@ -116,7 +116,7 @@ def test_generation_with_and_without_cache(problems: list[Problem], tokens_per_s
         np.testing.assert_allclose(a, b, atol=1e-7)
 
 
-def test_sequence_proposals_obey_dynamics_and_actuation(problems: list[Problem]) -> None:
+def test_sequence_proposals_obey_the_dynamics_and_end_at_the_goal(problems: list[Problem]) -> None:
     rels = [solve_rel(problem).trajectory for problem in problems]
     groups = propose_batch(model(SEQUENCE), problems, n_candidates=3, rels=rels)
     for problem, group in zip(problems, groups):
@@ -127,8 +127,28 @@ def test_sequence_proposals_obey_dynamics_and_actuation(problems: list[Problem])
             robot, dt = problem.scenario.robot, problem.scenario.dt
             residual = dynamics.dynamics_residual(states, controls, dt, robot)
             assert np.abs(residual).max() < 1e-12
-            excess = actuation_excess(problem.scenario, states[:-1, 2], controls)
-            assert excess.max() < 1e-9
+            np.testing.assert_allclose(states[-1], problem.goal, atol=1e-9)
+
+
+def test_generated_controls_are_within_the_actuation_limit(problems: list[Problem]) -> None:
+    controls = generate(model(SEQUENCE).net, problems, np.full(len(problems), -0.3))
+    for problem, each in zip(problems, controls):
+        states = Trajectory.from_controls(problem, each).states
+        assert actuation_excess(problem.scenario, states[:-1, 2], each).max() < 1e-9
+
+
+def test_of_the_samples_those_that_pass_the_obstacles_come_first(problems: list[Problem]) -> None:
+    rels = [solve_rel(problem).trajectory for problem in problems]
+    many = propose_batch(model(MODES), problems, n_candidates=8, rels=rels)
+    one = propose_batch(model(MODES), problems, rels=rels)
+    for problem, group, (first,) in zip(problems, many, one):
+        depths = [
+            keep_out_depth(problem.scenario, p.trajectory.states[:-1, :2], problem.node_times[:-1])
+            for p in group
+        ]
+        inside = [int((depth > 1e-3).sum()) for depth in depths]
+        assert inside == sorted(inside)
+        assert first.score == group[0].score
 
 
 def test_the_reward_to_go_changes_what_is_generated(problems: list[Problem]) -> None:

@@ -16,6 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 from art_policy import train as train_module
+from art_policy.autoregressive import Autoregressive
 from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
@@ -23,7 +24,7 @@ from art_policy.sequence import DISC_SPEED
 from art_policy.train import CHECKPOINT_NAME, _initialise, train
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import LOG_NAME
-from art_policy.training_data import problem_batch
+from art_policy.training_data import SequenceSet, problem_batch
 from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
@@ -132,6 +133,34 @@ def test_other_knots_and_more_hypotheses_begin_with_the_same_paths(
     _initialise(more, str(tmp_path))
     ours, theirs = (dict(each.named_parameters())["net.query_embedding"] for each in (more, model))
     torch.testing.assert_close(ours[:4], theirs, atol=0.0, rtol=0.0)
+
+
+def test_several_modes_begin_near_the_one_that_was(dataset: PackedDataset, tmp_path: Path) -> None:
+    single = ART(TINY_SEQUENCE).eval()
+    single.save_pretrained(tmp_path)
+    several = ART(replace(TINY_SEQUENCE, n_modes=3)).eval()
+    _initialise(several, str(tmp_path))
+    tokens = torch.randn(5, TINY_SEQUENCE.width)
+    assert isinstance(single.net, Autoregressive)
+    assert isinstance(several.net, Autoregressive)
+    with torch.inference_mode():
+        one, _ = single.net.decode_controls(tokens)
+        modes, logits = several.net.decode_controls(tokens)
+    assert logits.shape == (5, 3)
+    spread = 0.02 * TINY_SEQUENCE.width**0.5
+    assert (modes - one).std() == pytest.approx(spread, rel=0.5)
+    several.save_pretrained(tmp_path)
+    with pytest.raises(ValueError, match="n_modes"):
+        _initialise(single, str(tmp_path))
+
+
+def test_openings_are_the_first_steps(dataset: PackedDataset) -> None:
+    rows, generator = np.arange(len(dataset)), torch.Generator().manual_seed(0)
+    openings = SequenceSet(dataset, rows, (3.5, 2.5), 100, openings=1.0)
+    batch = openings.batch(torch.arange(8), generator)
+    assert batch.states.shape == (8, 16, 6)
+    torch.testing.assert_close(batch.states[:, 0], batch.problems.start)
+    assert openings.batch(torch.arange(8), None).states.shape[1] > 16  # not of validation
 
 
 def test_training_from_a_model_keeps_its_scales(dataset: PackedDataset, tmp_path: Path) -> None:
