@@ -148,7 +148,8 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
         shapes.append({0: past + config.tokens_per_step})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of axes that share a name, and of torchvision
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        for name in ("torch.onnx", "onnxscript", "onnx_ir"):
+            logging.getLogger(name).setLevel(logging.ERROR)
         program = torch.onnx.export(
             plain.eval(),
             example,

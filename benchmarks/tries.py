@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import time
 from pathlib import Path
 from typing import Any
@@ -39,6 +38,7 @@ from art_policy.sequence import ProblemBatch
 from art_policy.train import train
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import LOG_NAME
+from benchmarks.planning import markdown
 from freeflyer_datasets import PackedDataset
 from freeflyer_env.scenario import Problem
 
@@ -286,31 +286,30 @@ def main() -> None:
             row[f"{scenes}, first"], row[f"{scenes}, best of 4"] = groups[name], groups[four]
         for name in ("REL", "best known"):
             rows.setdefault(name, {})[f"{scenes}, first"] = groups[name]
-    content = {"steps": options.steps, "problems": options.problems, "variants": rows}
-    content["made"] = time.strftime("%Y-%m-%d")
+    content = {"steps": options.steps, "problems": options.problems, "starts": options.starts}
+    content |= {"made": time.strftime("%Y-%m-%d"), "rows": table_rows(rows), "variants": rows}
     path = options.out / "tries.json"
     path.write_text(json.dumps(finite(content), indent=1) + "\n", encoding="utf-8")
-    print(table(rows))
+    print(markdown(table_rows(rows)))
 
 
-def table(rows: dict[str, dict[str, Any]]) -> str:
-    """The comparison as a Markdown table."""
-    lines = [
-        "| variant | distance, first | held-out: infeasible | improvement, 1 and 4 | iterations "
-        "| random: infeasible | improvement, 1 and 4 |",
-        "|---|---|---|---|---|---|---|",
-    ]
+def table_rows(rows: dict[str, dict[str, Any]]) -> list[dict[str, object]]:
+    """The comparison, a row for each variant."""
+    table: list[dict[str, object]] = []
     for name, row in rows.items():
-        cells = [name, f"{1e3 * row.get('val_chosen_distance', math.nan):.0f} mm"]
+        distance = row.get("val_chosen_distance")
+        line: dict[str, object] = {"variant": name}
+        line["first to optimum, mm"] = "-" if distance is None else f"{1e3 * distance:.0f}"
         for scenes in ("held-out", "random"):
             one = row[f"{scenes}, first"]
             four = row.get(f"{scenes}, best of 4", one)
-            gain = ", ".join(f"{x['suboptimality_improvement']:+.1%}" for x in (one, four))
-            cells += [f"{one['infeasible_rate']:.1%}", gain]
-            if scenes == "held-out":
-                cells.append(f"{one['mean_iterations']:.2f}")
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+            line[f"{scenes}: infeasible"] = f"{one['infeasible_rate']:.1%}"
+            gains = (x["suboptimality_improvement"] for x in (one, four))
+            line[f"{scenes}: improvement, 1 and 4"] = ", ".join(f"{x:+.1%}" for x in gains)
+            iterations = one["mean_iterations"]
+            line[f"{scenes}: iterations"] = "-" if not iterations else f"{iterations:.2f}"
+        table.append(line)
+    return table
 
 
 if __name__ == "__main__":
