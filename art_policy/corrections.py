@@ -20,7 +20,7 @@ from art_policy.generation import generate
 from freeflyer_datasets.loading import PackedDataset
 from freeflyer_datasets.packing import Chunk, write_pack
 from freeflyer_datasets.shards import LABEL_REL, LABEL_SCP
-from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, keep_out_depth
+from freeflyer_env.constraints import nodes_inside
 from freeflyer_env.planning import SCPConfig, Trajectory, race_scp, solve_rel
 from freeflyer_env.robot import FloatArray
 from freeflyer_env.scenario import Problem
@@ -149,19 +149,16 @@ def _correct(problem: Problem, controls: FloatArray, poses: FloatArray) -> _Corr
 
 def _chunk(found: list[_Correction], data: PackedDataset) -> Chunk:
     obstacles = np.zeros((len(found), *data.obstacles.shape[1:]))
-    c_rel = np.zeros(len(found), dtype=np.int32)
-    for number, (problem, rel, _) in enumerate(found):
+    for number, (problem, _, _) in enumerate(found):
         table = problem.scenario.obstacles.rows()
         obstacles[number, : len(table), : table.shape[1]] = table
-        depth = keep_out_depth(problem.scenario, rel.states[:-1, :2], problem.node_times[:-1])
-        c_rel[number] = int((depth > FEASIBILITY_TOLERANCE).sum())
     trajectories = [trajectory for _, rel, best in found for trajectory in (rel, best)]
     return Chunk(
         start=np.array([problem.start for problem, _, _ in found]),
         goal=np.array([problem.goal for problem, _, _ in found]),
         obstacles=obstacles,
         final_time=np.array([problem.final_time for problem, _, _ in found]),
-        c_rel=c_rel,
+        c_rel=np.array([nodes_inside(problem, rel.states) for problem, rel, _ in found]),
         rel_cost=np.array([rel.cost for _, rel, _ in found]),
         problem_index=np.repeat(np.arange(len(found)), 2),
         label=np.tile([LABEL_REL, LABEL_SCP], len(found)),

@@ -12,7 +12,7 @@ import torch
 from art_policy.generation import SteppedModel, generate
 from art_policy.multi_hypothesis import interpolation_matrix
 from art_policy.sequence import ProblemBatch
-from freeflyer_env.constraints import keep_out_depth
+from freeflyer_env.constraints import nodes_inside
 from freeflyer_env.planning.homotopy import push_out
 from freeflyer_env.planning.trajectory import Trajectory
 from freeflyer_env.robot import FloatArray
@@ -155,6 +155,5 @@ def _sequences(
 
 def _judge(problem: Problem, trajectory: Trajectory) -> Proposal:
     """Scores a generated trajectory by its nodes inside keep-out discs, then by its cost."""
-    nodes, times = trajectory.states[:-1, :2], problem.node_times[:-1]
-    inside = (keep_out_depth(problem.scenario, nodes, times) > _INSIDE).sum()
+    inside = nodes_inside(problem, trajectory.states, _INSIDE)
     return Proposal(trajectory, -float(inside + min(trajectory.cost, 1.0)))

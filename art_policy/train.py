@@ -28,11 +28,11 @@ from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.model_card import write_card
-from art_policy.multi_hypothesis import MultiHypothesis, hats, knot_places
 from art_policy.throughput import flops_per_example, peak_flops
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import Interrupt, Log
 from art_policy.training_data import HypothesisSet, SequenceSet
+from art_policy.transfer import begin_with
 
 if TYPE_CHECKING:
     from accelerate import Accelerator
@@ -82,7 +82,7 @@ class _State:
         torch.manual_seed(config.seed)
         model = ART(model_config).to(accelerator.device)
         if config.init is not None:
-            _initialise(model, config.init)
+            begin_with(model, config.init)
         matrices = [p for p in model.parameters() if p.dim() >= 2]
         vectors = [p for p in model.parameters() if p.dim() < 2]
         groups = [
@@ -360,43 +360,6 @@ def _examples(
         )
 
     return hypotheses(0, config.tails, most), hypotheses(1, 0.0, None)
-
-
-def _initialise(model: ART, name: str) -> None:
-    """Begins with the weights of another model.
-
-    More hypotheses than it has begin anew; other knots begin where its own put them. Several modes
-    begin as one that had none, but for what is drawn, and grow apart.
-    """
-    other = ART.from_pretrained(name)
-    ours, theirs = model.config.to_dict(), other.config.to_dict()
-    changed = [key for key in ours if ours[key] != theirs[key]]
-    free = {"n_hypotheses", "n_knots", "knot_spacing", "dropout", "envelope", "returns_to_go"}
-    if other.config.n_modes == 1:
-        free.add("n_modes")
-    if changed := sorted(set(changed) - free):
-        raise ValueError(
-            f"TrainConfig.init: {name!r} is of another {', '.join(changed)} than the model that is "
-            "to be trained."
-        )
-    weights = other.state_dict()
-    if isinstance(model.net, MultiHypothesis):
-        queries = model.net.query_embedding.detach().clone()
-        both = min(len(queries), other.config.n_hypotheses)
-        queries[:both] = weights["net.query_embedding"][:both]
-        weights["net.query_embedding"] = queries
-        places = knot_places(model.config.n_knots, model.config.knot_spacing)[1:-1]
-        values = hats(other.config.n_knots, places, other.config.knot_spacing).float()
-        for name in ("net.knot_decoder.linear.weight", "net.knot_decoder.linear.bias"):
-            by_knot = weights[name].unflatten(0, (-1, 3))  # (n_knots, 3, ...)
-            weights[name] = torch.einsum("ij,j...->i...", values, by_knot).flatten(0, 1)
-    elif model.config.n_modes > other.config.n_modes:
-        drawn = model.state_dict()
-        for name in ("net.control_decoder.linear.weight", "net.control_decoder.linear.bias"):
-            repeats = (model.config.n_modes,) + (1,) * (weights[name].dim() - 1)
-            weights[name] = drawn[name] + weights[name].repeat(repeats)
-        weights |= {name: drawn[name] for name in drawn if name.startswith("net.mode_decoder.")}
-    model.load_state_dict(weights)
 
 
 def _batch_size(training: ExampleSet, config: TrainConfig) -> int:

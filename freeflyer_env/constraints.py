@@ -69,6 +69,22 @@ def keep_out_depth(
     return np.max(scenario.keep_out_radii - gaps, axis=-1)
 
 
+def nodes_inside(
+    problem: Problem, states: FloatArray, tolerance: float = FEASIBILITY_TOLERANCE
+) -> int:
+    """How many of the ``N`` nodes of states ``(N + 1, 6)`` are inside a keep-out disc.
+
+    Of the relaxed trajectory it is the paper's ``C_REL(t_1)``.
+
+    Args:
+        problem: Gives the obstacles and the times of the nodes.
+        states: ``(N + 1, 6)``.
+        tolerance: Depth in m from which a node counts.
+    """
+    depth = keep_out_depth(problem.scenario, states[:-1, :2], problem.node_times[:-1])
+    return int((depth > tolerance).sum())
+
+
 def between_nodes_depth(problem: Problem, states: FloatArray) -> FloatArray:
     """How deep each segment between nodes is inside a keep-out disc, ``(N - 1,)`` in m; exact.
 

@@ -29,7 +29,7 @@ from freeflyer_datasets.shards import (
     shard_path,
     write_shard,
 )
-from freeflyer_env.constraints import FEASIBILITY_TOLERANCE, keep_out_depth
+from freeflyer_env.constraints import nodes_inside
 from freeflyer_env.scenario import Problem
 
 if TYPE_CHECKING:
@@ -237,9 +237,7 @@ def solve_problems(recipe: Recipe, first: int, count: int) -> Shard:
         if not records:
             failures[local] = _UNSOLVED
             continue
-        nodes = records[0]["trajectory"].states[:-1, :2]
-        depth = keep_out_depth(problem.scenario, nodes, problem.node_times[:-1])
-        c_rel[local] = int((depth > FEASIBILITY_TOLERANCE).sum())
+        c_rel[local] = nodes_inside(problem, records[0]["trajectory"].states)
         rel_cost[local] = records[0]["trajectory"].cost
         rows += [{"problem": local, **record} for record in records]
     return _pack(recipe, first, problems, c_rel, rel_cost, failures, rows)

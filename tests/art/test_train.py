@@ -21,10 +21,11 @@ from art_policy.examination import Examiner
 from art_policy.layers import ARTConfig
 from art_policy.model import ART
 from art_policy.sequence import DISC_SPEED
-from art_policy.train import CHECKPOINT_NAME, _initialise, train
+from art_policy.train import CHECKPOINT_NAME, train
 from art_policy.train_config import TrainConfig
 from art_policy.train_io import LOG_NAME
 from art_policy.training_data import SequenceSet, problem_batch
+from art_policy.transfer import begin_with
 from freeflyer_datasets.loading import PackedDataset
 
 TINY = ARTConfig(width=32, n_layers=2, n_heads=2, n_hypotheses=4, dropout=0.1)
@@ -123,14 +124,14 @@ def test_other_knots_and_more_hypotheses_begin_with_the_same_paths(
     model = ART(first).eval()
     model.save_pretrained(tmp_path)
     finer = ART(replace(first, n_knots=13)).eval()  # every second knot is where one was
-    _initialise(finer, str(tmp_path))
+    begin_with(finer, str(tmp_path))
     problems = problem_batch(dataset, np.arange(3))
     with torch.inference_mode():
         (paths, scores), (fine_paths, fine_scores) = model(problems), finer(problems)
     torch.testing.assert_close(fine_paths[:, :, 1::2], paths)
     torch.testing.assert_close(fine_scores, scores)
     more = ART(replace(first, n_hypotheses=6)).eval()
-    _initialise(more, str(tmp_path))
+    begin_with(more, str(tmp_path))
     ours, theirs = (dict(each.named_parameters())["net.query_embedding"] for each in (more, model))
     torch.testing.assert_close(ours[:4], theirs, atol=0.0, rtol=0.0)
 
@@ -139,7 +140,7 @@ def test_several_modes_begin_near_the_one_that_was(dataset: PackedDataset, tmp_p
     single = ART(TINY_SEQUENCE).eval()
     single.save_pretrained(tmp_path)
     several = ART(replace(TINY_SEQUENCE, n_modes=3)).eval()
-    _initialise(several, str(tmp_path))
+    begin_with(several, str(tmp_path))
     tokens = torch.randn(5, TINY_SEQUENCE.width)
     assert isinstance(single.net, Autoregressive)
     assert isinstance(several.net, Autoregressive)
@@ -151,7 +152,7 @@ def test_several_modes_begin_near_the_one_that_was(dataset: PackedDataset, tmp_p
     assert (modes - one).std() == pytest.approx(spread, rel=0.5)
     several.save_pretrained(tmp_path)
     with pytest.raises(ValueError, match="n_modes"):
-        _initialise(single, str(tmp_path))
+        begin_with(single, str(tmp_path))
 
 
 def test_openings_are_the_first_steps(dataset: PackedDataset) -> None:
