@@ -91,6 +91,7 @@ def generate(
     returns_to_go: FloatArray,
     *,
     draws: Sequence[int] | None = None,
+    prompts: Sequence[FloatArray] | None = None,
     use_cache: bool = True,
 ) -> list[FloatArray]:
     """Trajectories of an autoregressive model, as their controls.
@@ -101,6 +102,8 @@ def generate(
         returns_to_go: ``(B,)`` rewards-to-go at the start, minus the cost asked for, in m/s.
         draws: ``(B,)`` numbers of samples from the model's modes, the same in every call; 0, and by
             default, the most probable controls.
+        prompts: ``B`` arrays ``(n, 3)`` of controls that are applied first, whatever the model
+            thinks; it goes on from there.
         use_cache: Whether to keep keys and values of the past, or to run the whole sequence again
             at every step (slow; the same result).
 
@@ -122,10 +125,15 @@ def generate(
     budget = np.zeros(len(problems))
     longest, rows = max(problem.n_steps for problem in problems), np.arange(len(problems))
     noise = _mode_noise(draws or [0] * len(problems), longest, net.config.n_modes)
+    given = np.full((len(problems), longest, 3), np.nan)
+    for row, prompt in enumerate(prompts or ()):
+        given[row, : len(prompt)] = prompt[:longest]
+    given[to_left] *= MIRROR_CONTROL[0]
     steps, controls = net.steps(seen, use_cache), []
     for step in range(longest):
         modes, logits = steps.predict(state, returns, budget, time_to_go)
         control = modes[rows, (logits + noise[:, step]).argmax(axis=1)]
+        control = np.where(np.isnan(given[:, step]), control, given[:, step])
         control = _within_limits(problems[0].scenario, state, control)
         steps.apply(control)
         returns = np.minimum(returns + np.abs(control).sum(axis=1), 0.0)

@@ -33,6 +33,10 @@ if TYPE_CHECKING:
 #: A warm start this deep inside a keep-out disc (m) is not worth refining.
 _DEEPEST_WARM_START = 0.1
 
+#: First half-width of the trust region for a model's candidates (m, rad, m/s, rad/s). They need no
+#: wider one, and in a wider one SCP wanders among solutions of the same cost before it settles.
+_TRUST_REGION = 3.0
+
 #: Homotopy classes tried where the model's proposals and REL lead nowhere.
 _REROUTES = 12
 
@@ -51,7 +55,8 @@ class PlannerConfig:
             on; ``"portfolio"``, always refined too, so that the plan is never
             worse than REL + SCP; ``"never"``, to see what the model does alone. Unless ``"never"``,
             other homotopy classes are the last resort where REL fails, too.
-        scp: Settings of the SCP loop. Its ``reroutes`` play no part for the model's candidates.
+        scp: Settings of the SCP loop. For the model's candidates its ``reroutes`` play no part, and
+            the trust region begins at 3 m or less.
     """
 
     n_candidates: int = 1
@@ -199,7 +204,13 @@ class _Search:
         if not warm_starts:
             return
         began = time.perf_counter()
-        results = race_scp(self.problem, list(warm_starts.values()), self.config.scp)
+        first = min(_TRUST_REGION, self.config.scp.trust_region_start)
+        config = replace(
+            self.config.scp,
+            trust_region_start=first,
+            trust_region_end=min(first, self.config.scp.trust_region_end),
+        )
+        results = race_scp(self.problem, list(warm_starts.values()), config)
         self.timings["scp"] += time.perf_counter() - began
         for (name, warm_start), result in zip(warm_starts.items(), results):
             self._add("art", name, warm_start, result)

@@ -39,7 +39,11 @@ class Proposal:
 
 
 def propose(
-    model: ART | OnnxART, problem: Problem, n_candidates: int = 1, rel: Trajectory | None = None
+    model: ART | OnnxART,
+    problem: Problem,
+    n_candidates: int = 1,
+    rel: Trajectory | None = None,
+    guides: Sequence[Trajectory] | None = None,
 ) -> list[Proposal]:
     """Warm starts for one problem, best first.
 
@@ -48,8 +52,13 @@ def propose(
         problem: What to plan.
         n_candidates: Most proposals; a multi-hypothesis model has ``n_hypotheses``.
         rel: REL's trajectory; an autoregressive model needs its cost as the reward-to-go.
+        guides: Other warm starts, those of a multi-hypothesis model for example. An autoregressive
+            model goes on where their first 16 steps lead, one sequence for each guide, instead
+            of choosing its own way.
     """
-    return propose_batch(model, [problem], n_candidates, None if rel is None else [rel])[0]
+    rels = None if rel is None else [rel]
+    every_guide = None if guides is None else [guides]
+    return propose_batch(model, [problem], n_candidates, rels, every_guide)[0]
 
 
 def propose_batch(
@@ -57,12 +66,13 @@ def propose_batch(
     problems: Sequence[Problem],
     n_candidates: int = 1,
     rels: Sequence[Trajectory] | None = None,
+    guides: Sequence[Sequence[Trajectory]] | None = None,
 ) -> list[list[Proposal]]:
     """As :func:`propose`, for many problems in one pass.
 
     Raises:
-        ValueError: If ``n_candidates`` is not positive, or REL's trajectories are missing where the
-            model needs them.
+        ValueError: If ``n_candidates`` is not positive, REL's trajectories are missing where the
+            model needs them, or there are guides for a model that proposes whole paths.
     """
     if n_candidates < 1:
         raise ValueError(f"n_candidates must be at least 1, got {n_candidates}.")
@@ -74,7 +84,12 @@ def propose_batch(
                 "An autoregressive model needs REL's trajectory of each problem for its "
                 "reward-to-go; pass rel=solve_rel(problem).trajectory."
             )
-        return _sequences(model, problems, n_candidates, [rel.cost for rel in rels])
+        costs = [rel.cost for rel in rels]
+        if guides:
+            return _guided(model, problems, n_candidates, costs, guides)
+        return _sequences(model, problems, n_candidates, costs)
+    if guides:
+        raise ValueError("Guides are for autoregressive models; this one proposes whole paths.")
     return _hypotheses(model, problems, n_candidates)
 
 
@@ -132,6 +147,9 @@ _COST_STEP = 0.05
 #: once.
 _N_SAMPLES = 8
 
+#: Steps of a guide that a model is made to begin with.
+_PROMPT = 16
+
 #: A node so deep in a keep-out disc (m) counts as inside.
 _INSIDE = 1e-3
 
@@ -145,11 +163,42 @@ def _sequences(
     tasks = [problem for problem in problems for _ in factors]
     returns = -np.outer(rel_costs, factors).ravel()
     draws = list(range(count)) * len(problems)
-    proposals = [
-        _judge(problem, Trajectory.from_controls(problem, controls).landed(problem))
-        for problem, controls in zip(tasks, generate(model, tasks, returns, draws=draws))
+    found = generate(model, tasks, returns, draws=draws)
+    return _ranked(tasks, found, [count] * len(problems), n_candidates)
+
+
+def _guided(
+    model: SteppedModel,
+    problems: Sequence[Problem],
+    n_candidates: int,
+    rel_costs: Sequence[float],
+    guides: Sequence[Sequence[Trajectory]],
+) -> list[list[Proposal]]:
+    counts = [len(several) for several in guides]
+    tasks = [problem for problem, count in zip(problems, counts) for _ in range(count)]
+    prompts = [
+        Trajectory.from_poses(problem, guide.states[:-1, :3], with_controls=True).controls[:_PROMPT]
+        for problem, several in zip(problems, guides)
+        for guide in several
     ]
-    groups = [proposals[i : i + count] for i in range(0, len(proposals), count)]
+    found = generate(model, tasks, -np.repeat(rel_costs, counts), prompts=prompts)
+    return _ranked(tasks, found, counts, n_candidates)
+
+
+def _ranked(
+    tasks: Sequence[Problem],
+    sequences: Sequence[FloatArray],
+    counts: Sequence[int],
+    n_candidates: int,
+) -> list[list[Proposal]]:
+    """Proposals of several problems, each with a number of sequences, best first."""
+    proposals = iter(
+        [
+            _judge(problem, Trajectory.from_controls(problem, controls).landed(problem))
+            for problem, controls in zip(tasks, sequences)
+        ]
+    )
+    groups = [[next(proposals) for _ in range(count)] for count in counts]
     return [sorted(group, key=lambda p: -p.score)[:n_candidates] for group in groups]
 
 

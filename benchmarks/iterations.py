@@ -1,9 +1,9 @@
-"""What the number of SCP iterations depends on: how exact a warm start is, and when SCP stops.
+"""What the number of SCP iterations depends on: the warm start, the trust region, the tolerance.
 
 ``python -m benchmarks.iterations`` solves held-out problems from warm starts of growing fidelity,
 from a model's proposal to the solution itself, with the paper's tolerance of the cost and with that
-of ``SCPConfig.quick``, and prints a Markdown table; ``--out FILE`` writes it as JSON. Two is the
-least: SCP stops when two solutions agree.
+of ``SCPConfig.quick``, then REL's and the proposal in other trust regions, and prints a Markdown
+table; ``--out FILE`` writes it as JSON. Two is the least: SCP stops when two solutions agree.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,8 @@ from freeflyer_env.planning import SCPConfig, Trajectory, solve_rel, solve_scp
 from freeflyer_env.robot import FloatArray
 
 KNOTS = [(20, "uniform"), (20, "ends"), (40, "uniform"), (40, "ends")]
+#: First half-width of the trust region in m: the paper's, and others.
+FIRST, TRUST_REGIONS = SCPConfig().trust_region_start, (3.0, 1.0, 0.3)
 SETTINGS = {"paper": SCPConfig(), "quick": SCPConfig.quick()}
 
 
@@ -74,9 +77,14 @@ def measure(model_name: str, n_problems: int) -> list[Row]:
         solution = solve_scp(problem, proposal).trajectory
         if rel is None or solution is None:
             continue
-        for name, warm_start in warm_starts(problem, proposal, solution, rel):
+        cases = [(*case, FIRST) for case in warm_starts(problem, proposal, solution, rel)]
+        for first in TRUST_REGIONS:
+            cases.append((f"REL, trust region from {first:g} m", rel, first))
+            cases.append((f"proposal, trust region from {first:g} m", proposal, first))
+        for name, warm_start, first in cases:
             row = found.setdefault(name, {})
             for setting, config in SETTINGS.items():
+                config = replace(config, trust_region_start=first)
                 result = solve_scp(problem, warm_start, config)
                 row.setdefault(setting, []).append(result.iterations if result.solved else np.nan)
     return [

@@ -2,8 +2,9 @@
 
 ``python -m benchmarks.tries DATASET --out FOLDER`` trains every variant (resumable: what is there
 is kept), then compares them all in one evaluation on held-out and on random scenes, and writes
-``tries.json`` and a Markdown table. One variant replaces the head by flow matching, the usual
-generative baseline. ``DATASET`` is a Minari id or a folder of shards.
+``tries.json`` and a Markdown table. Two variants are other kinds of model: flow matching, the usual
+generative baseline, and paths that are conditioned on the homotopy class. ``DATASET`` is a Minari
+id or a folder of shards.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ from art_policy.train_config import TrainConfig
 from art_policy.train_io import LOG_NAME
 from benchmarks.planning import markdown
 from freeflyer_datasets import PackedDataset
-from freeflyer_env.scenario import Problem
+from freeflyer_env.planning.homotopy import homotopy_starts
+from freeflyer_env.scenario import Obstacles, Problem, Scenario
 
 #: The base variant: its model, and number of problems. It is half the size of the shipped models.
 BASE, _BASE = ARTConfig(width=128, n_heads=4), 20_000
@@ -67,7 +69,6 @@ VARIANTS: list[tuple[str, int, dict[str, Any], dict[str, Any], dict[str, Any]]] 
     ("a fourth of the examples begins in flight", _BASE, {}, {}, {"tails": 0.25}),
     ("discs added where they change no optimum", _BASE, {}, {}, {"max_discs": 8}),
 ]
-FLOW, FLOW_NAME = "flow matching, 8 steps", "flow.pt"
 
 
 class FlowMatching(nn.Module):
@@ -139,16 +140,109 @@ class FlowMatching(nn.Module):
         return paths * self.scale, torch.zeros(paths.shape[:2])
 
 
-def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> None:
-    """Trains the baseline on as many problems as the base variant."""
+class Conditioned(nn.Module):
+    """One path for each homotopy class: disc tokens say on which side the disc is to be passed.
+
+    It learns from every optimum; the classes to propose are those of :func:`.homotopy_starts`,
+    shortest path first.
+    """
+
+    def __init__(self, config: ARTConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.query_embedding = nn.Parameter(torch.randn(1, config.width))
+        self.problem_encoder = Encoder(20, config.width)
+        self.disc_encoder = Encoder(15, config.width)
+        self.blocks = nn.ModuleList(Block(config) for _ in range(config.n_layers))
+        self.knot_decoder = Decoder(config.width, 3 * config.n_knots)
+        initialise(self, config.n_layers)
+        self.register_buffer("scale", torch.tensor([0.25, 0.25, 0.5]))
+
+    @property
+    def device(self) -> torch.device:
+        """Where the weights are."""
+        return self.query_embedding.device
+
+    def knots(self, problems: ProblemBatch, sides: Tensor) -> Tensor:
+        """Deviations ``(B, n_knots, 3)`` of paths with the discs on ``sides`` ``(B, M)``, +-1."""
+        discs = torch.cat([disc_features(problems, self.config.table), sides[..., None]], dim=2)
+        tokens = torch.cat(
+            [
+                self.query_embedding.expand(len(problems), -1, -1),
+                self.problem_encoder(problem_features(problems, self.config.table))[:, None],
+                self.disc_encoder(discs),
+            ],
+            dim=1,
+        )
+        for block in self.blocks:
+            tokens = block(tokens)
+        return self.knot_decoder(tokens[:, 0]).view(-1, self.config.n_knots, 3) * self.scale
+
+    def loss(self, batch: HypothesisBatch, generator: torch.Generator) -> Tensor:
+        """Distance to an optimum drawn for each problem, whose class is told."""
+        rows = torch.arange(len(batch))
+        known = batch.costs.isfinite().float()
+        drawn = torch.multinomial(known.cpu(), 1, generator=generator)[:, 0].to(self.device)
+        target = batch.paths[rows, drawn]  # (B, S, 3)
+        share = torch.linspace(0.0, 1.0, target.shape[1], device=self.device)[:, None]
+        way = (batch.problems.goal - batch.problems.start)[:, None, :2]
+        positions = batch.problems.start[:, None, :2] + share * way + target[..., :2]
+        knots = self.knots(batch.problems, sides_of(positions, batch.problems.discs))
+        matrix = interpolation_matrix(self.config.n_knots, target.shape[1]).to(self.device)
+        errors = torch.einsum("sk,bkc->bsc", matrix, knots) - target
+        weight = errors.new_tensor([1.0, 1.0, HypothesisLoss.heading_weight])
+        squares = (errors.square() * weight).sum(2).mean(1)
+        scale = HypothesisLoss.length_scale
+        return ((scale**2 + squares).sqrt() - scale).mean() / scale
+
+    def forward(self, problems: ProblemBatch) -> tuple[Tensor, Tensor]:
+        """Deviations at the knots ``(B, H, n_knots, 3)``, and ranks of the classes ``(B, H)``."""
+        size = self.config.n_hypotheses
+        found = [self._classes(problems[row]) for row in torch.arange(len(problems)).split(1)]
+        knots = torch.stack([torch.stack((part * size)[:size]) for part in found])
+        ranks = -torch.arange(size, dtype=torch.float32).expand(len(problems), -1)
+        return knots, ranks
+
+    def _classes(self, problem: ProblemBatch) -> list[Tensor]:
+        """Paths ``(n_knots, 3)`` of the classes of one problem, the shortest first."""
+        rows = problem.discs[0][problem.present[0]].double().numpy()
+        ends = problem.start[0].double().numpy(), problem.goal[0].double().numpy()
+        scene = Scenario(Obstacles.from_rows(rows))
+        whole = Problem(scene, *ends, float(problem.final_time))
+        starts = homotopy_starts(whole, self.config.n_hypotheses)
+        paths = torch.tensor(np.array([start.states[:-1, :2] for start in starts])).float()
+        sides = sides_of(paths, problem.discs.expand(len(starts), -1, -1))
+        index = torch.zeros(len(starts), dtype=torch.long)
+        return list(self.knots(problem[index], sides))
+
+
+def sides_of(paths: Tensor, discs: Tensor) -> Tensor:
+    """``(B, M)``: 1 where paths ``(B, S, 2)`` pass a disc on their left, -1 on their right."""
+    offset = discs[:, None, :, :2] - paths[:, :, None]  # (B, S, M, 2)
+    direction = torch.gradient(paths, dim=1)[0][:, :, None].expand_as(offset)
+    nearest = offset.square().sum(3).argmin(1)[:, None, :, None].expand(-1, -1, -1, 2)
+    o, d = offset.gather(1, nearest)[:, 0], direction.gather(1, nearest)[:, 0]
+    return (d[..., 0] * o[..., 1] - d[..., 1] * o[..., 0]).sign()
+
+
+#: Models of another kind: class and file, by name.
+OTHERS: dict[str, tuple[type[FlowMatching | Conditioned], str]] = {
+    "flow matching, 8 steps": (FlowMatching, "flow.pt"),
+    "conditioned on the homotopy class": (Conditioned, "conditioned.pt"),
+}
+
+
+def train_other(name: str, data: PackedDataset, config: TrainConfig, folder: Path) -> None:
+    """Trains a model of another kind on as many problems as the base variant."""
     from art_policy.training_data import HypothesisSet
 
-    path = folder / FLOW_NAME
+    kind, file = OTHERS[name]
+    path = folder / file
     if path.is_file():
         return
     torch.manual_seed(0)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = FlowMatching(BASE).to(device)
+    model = kind(BASE).to(device)
     training = HypothesisSet(data, first_problems(data, _BASE), model.config.table).to(device)
     assert config.max_steps
     optimizer = torch.optim.AdamW(model.parameters(), lr=config.learning_rate, weight_decay=0.05)
@@ -172,11 +266,15 @@ def train_flow(data: PackedDataset, config: TrainConfig, folder: Path) -> None:
     torch.save(model.cpu().state_dict(), path)
 
 
-def load_flow(folder: Path) -> FlowMatching:
-    """The trained baseline."""
-    model = FlowMatching(BASE)
-    model.load_state_dict(torch.load(folder / FLOW_NAME, weights_only=True))
-    return model.eval()
+def load_others(folder: Path) -> dict[str, nn.Module]:
+    """The models of other kinds that are there."""
+    models: dict[str, nn.Module] = {}
+    for name, (kind, file) in OTHERS.items():
+        if (folder / file).is_file():
+            models[name] = kind(BASE)
+            models[name].load_state_dict(torch.load(folder / file, weights_only=True))
+            models[name].eval()
+    return models
 
 
 def first_problems(data: PackedDataset, count: int) -> np.ndarray:
@@ -227,8 +325,7 @@ def evaluate_some(
     models: dict[str, Any] = {
         VARIANTS[i][0]: ART.from_pretrained(variant_folder(folder, i)) for i in variants
     }
-    if (folder / FLOW_NAME).is_file():
-        models[FLOW] = load_flow(folder)
+    models |= load_others(folder)
     return [evaluate_problem(models, *problem, 4, n_starts) for problem in problems]
 
 
@@ -264,14 +361,15 @@ def main() -> None:
     for index in options.variants:
         train_variant(data, index, config, options.out)
         print(f"trained: {VARIANTS[index][0]}", flush=True)
-    if 0 in options.variants:
-        train_flow(data, config, options.out)
+    for name in OTHERS if 0 in options.variants else ():
+        train_other(name, data, config, options.out)
+        print(f"trained: {name}", flush=True)
     if options.only_train:
         return
     rows: dict[str, dict[str, Any]] = {
         VARIANTS[i][0]: last_validation(variant_folder(options.out, i)) for i in options.variants
     }
-    names = [*rows, FLOW] if (options.out / FLOW_NAME).is_file() else list(rows)
+    names = [*rows, *load_others(options.out)]
     for scenes in ("held-out", "random"):
         problems = list(evaluation_problems(options.problems, scenes, seed=3))
         parts = [problems[i : i + 5] for i in range(0, len(problems), 5)]

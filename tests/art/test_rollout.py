@@ -14,7 +14,7 @@ from art_policy.model import ART
 from art_policy.rollout import decode_poses, propose, propose_batch
 from freeflyer_env import Obstacles, Problem, Scenario, dynamics, sample_problem
 from freeflyer_env.constraints import actuation_excess, keep_out_depth
-from freeflyer_env.planning import Trajectory, solve_rel, solve_scp
+from freeflyer_env.planning import Trajectory, solve_rel, solve_scp, straight_line
 
 MULTI = ARTConfig(width=32, n_layers=1, n_heads=2, n_hypotheses=4)
 SEQUENCE = replace(MULTI, head="autoregressive", context_length=8)
@@ -168,6 +168,34 @@ def test_samples_of_a_model_with_modes(problems: list[Problem]) -> None:
     together = generate(net, problems, returns, draws=[2, 1, 0])
     np.testing.assert_allclose(together[0], same[2], atol=1e-7)
     np.testing.assert_allclose(generate(net, problems[:1], returns[:1])[0], same[0], atol=1e-7)
+
+
+def test_a_prompt_is_what_a_sequence_begins_with(problems: list[Problem]) -> None:
+    net = model(SEQUENCE).net
+    returns = np.full(3, -0.3)
+    prompt = generate(net, problems, 1.5 * returns)
+    same = generate(net, problems, returns, prompts=[np.zeros((0, 3))] * 3)
+    led = generate(net, problems, returns, prompts=[each[:6] for each in prompt])
+    for free, plain, given, other in zip(
+        generate(net, problems, returns), same, prompt, led, strict=True
+    ):
+        np.testing.assert_allclose(plain, free, atol=1e-9)
+        np.testing.assert_allclose(other[:6], given[:6], atol=1e-9)
+        assert np.abs(other[6:] - given[6:]).max() > 1e-7
+
+
+def test_guides_are_followed_by_a_sequence_model(problems: list[Problem]) -> None:
+    rels = [solve_rel(problem).trajectory for problem in problems]
+    guides = [[straight_line(problem), rel] for problem, rel in zip(problems, rels)]
+    groups = propose_batch(model(SEQUENCE), problems, n_candidates=2, rels=rels, guides=guides)
+    for problem, rel, group in zip(problems, rels, groups):
+        assert len(group) == 2
+        nearest = min(np.abs(p.trajectory.states[8, :2] - rel.states[8, :2]).max() for p in group)
+        assert nearest < 0.1
+        for proposal in group:
+            np.testing.assert_allclose(proposal.trajectory.states[-1], problem.goal, atol=1e-9)
+    with pytest.raises(ValueError, match="this one proposes whole paths"):
+        propose(model(MULTI), problems[0], guides=guides[0])
 
 
 def test_bad_requests(problems: list[Problem]) -> None:
