@@ -79,7 +79,7 @@ def test_resuming_changes_nothing(
 
 def test_hypotheses_overfit_a_tiny_set(dataset: PackedDataset, tmp_path: Path) -> None:
     model = replace(TINY, width=64, dropout=0.0)
-    config = replace(SHORT, max_steps=400, batch_size=24, learning_rate=3e-3, ema_decay=0.9,
+    config = replace(SHORT, max_steps=800, batch_size=24, learning_rate=3e-3, ema_decay=0.9,
                      augment=False, tails=0.0, log_every=10,
                      validate_every=1000)  # fmt: skip
     train(dataset, model, config, tmp_path)
