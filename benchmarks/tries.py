@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import shlex
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -44,12 +46,12 @@ from freeflyer_datasets import PackedDataset
 from freeflyer_env.planning.homotopy import homotopy_starts
 from freeflyer_env.scenario import Obstacles, Problem, Scenario
 
-#: The base variant: its model, and number of problems. It is half the size of the shipped models.
+#: The base variant: its model, and its problems at most. It is half the size of the shipped models.
 BASE, _BASE = ARTConfig(width=128, n_heads=4), 20_000
 
 #: Name, problems, changes of the model, changes of the loss, changes of the training.
 VARIANTS: list[tuple[str, int, dict[str, Any], dict[str, Any], dict[str, Any]]] = [
-    ("base: 20,000 problems, 6 hypotheses, 40 knots, width 128", _BASE, {}, {}, {}),
+    ("base: 6 hypotheses, 40 knots, width 128", _BASE, {}, {}, {}),
     ("2,500 problems", 2_500, {}, {}, {}),
     ("5,000 problems", 5_000, {}, {}, {}),
     ("10,000 problems", 10_000, {}, {}, {}),
@@ -384,7 +386,8 @@ def main() -> None:
             row[f"{scenes}, first"], row[f"{scenes}, best of 4"] = groups[name], groups[four]
         for name in ("REL", "best known"):
             rows.setdefault(name, {})[f"{scenes}, first"] = groups[name]
-    content = {"steps": options.steps, "problems": options.problems, "starts": options.starts}
+    content: dict[str, Any] = {"command": f"python -m benchmarks.tries {shlex.join(sys.argv[1:])}"}
+    content |= {"steps": options.steps, "problems": options.problems, "starts": options.starts}
     content |= {"made": time.strftime("%Y-%m-%d"), "rows": table_rows(rows), "variants": rows}
     path = options.out / "tries.json"
     path.write_text(json.dumps(finite(content), indent=1) + "\n", encoding="utf-8")
@@ -405,7 +408,9 @@ def table_rows(rows: dict[str, dict[str, Any]]) -> list[dict[str, object]]:
             gains = (x["suboptimality_improvement"] for x in (one, four))
             line[f"{scenes}: improvement, 1 and 4"] = ", ".join(f"{x:+.1%}" for x in gains)
             iterations = one["mean_iterations"]
-            line[f"{scenes}: iterations"] = "-" if not iterations else f"{iterations:.2f}"
+            line[f"{scenes}: iterations"] = (
+                f"{iterations:.2f}" if np.isfinite(iterations or np.nan) else "-"
+            )
         table.append(line)
     return table
 
