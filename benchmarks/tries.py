@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import shlex
 import sys
 import time
@@ -407,10 +408,8 @@ def table_rows(rows: dict[str, dict[str, Any]]) -> list[dict[str, object]]:
             line[f"{scenes}: infeasible"] = f"{one['infeasible_rate']:.1%}"
             gains = (x["suboptimality_improvement"] for x in (one, four))
             line[f"{scenes}: improvement, 1 and 4"] = ", ".join(f"{x:+.1%}" for x in gains)
-            iterations = one["mean_iterations"]
-            line[f"{scenes}: iterations"] = (
-                f"{iterations:.2f}" if np.isfinite(iterations or np.nan) else "-"
-            )
+            iterations = one["mean_iterations"] or math.nan
+            line[f"{scenes}: iterations"] = "-" if math.isnan(iterations) else f"{iterations:.2f}"
         table.append(line)
     return table
 
