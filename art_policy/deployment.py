@@ -26,9 +26,7 @@ if TYPE_CHECKING:
     from art_policy.model import ART
 
 _INPUTS, _OUTPUTS = ("start", "goal", "discs", "final_time"), ("knots", "scores")
-_STEP_INPUTS = (*_INPUTS, "state", "returns", "budget", "time_to_go", "control", "control_time",
-                "keys", "values", "known")  # fmt: skip
-_STEP_OUTPUTS = ("controls", "logits", "keys_out", "values_out")
+_MOMENT = ("state", "returns", "budget", "time_to_go")
 _CONFIG_KEY = "art_config"
 _OPSET = 18
 
@@ -46,10 +44,21 @@ class _Plain(nn.Module):
         return self.net(ProblemBatch(start, goal, discs, final_time))
 
 
+def _past(config: ARTConfig) -> tuple[str, ...]:
+    """Names of the keys and values of every layer: apart, so that no step has to copy them more."""
+    return tuple(
+        f"{what}_{layer}" for what in ("keys", "values") for layer in range(config.n_layers)
+    )
+
+
+def _step_inputs(config: ARTConfig) -> tuple[str, ...]:
+    return (*_INPUTS, *_MOMENT, "control", "control_time", *_past(config), "known")
+
+
 class _Step(nn.Module):
     """One step of an autoregressive network: the last control, then what is known before the next.
 
-    ``keys`` and ``values`` ``(layers, B, heads, P, width / heads)`` are of the ``P`` tokens before;
+    Keys and values of a layer ``(B, heads, P, width / heads)`` are of the ``P`` tokens before;
     ``known`` ``(P + tokens of a step,)`` is False where there is nothing yet.
     """
 
@@ -57,11 +66,11 @@ class _Step(nn.Module):
         super().__init__()
         self.net = net
 
-    def forward(self, *inputs: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        given = dict(zip(_STEP_INPUTS, inputs))
+    def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
+        given = dict(zip(_step_inputs(self.net.config), inputs))
         net, known = self.net, given["known"]
         problems = ProblemBatch(*(given[name] for name in _INPUTS))
-        moment = (given[name][:, None] for name in ("state", "returns", "budget", "time_to_go"))
+        moment = (given[name][:, None] for name in _MOMENT)
         state, returns, budget, time_to_go = moment
         control, control_time = given["control"][:, None], given["control_time"][:, None]
         tokens = torch.cat(
@@ -76,12 +85,13 @@ class _Step(nn.Module):
         here = past + torch.arange(count)[:, None]
         there = torch.arange(known.shape[0])[None]
         seen = (there <= here) & (here - there < net.window) & known | (there == here)
-        cache = KeyValueCache(list(given["keys"].unbind(0)), list(given["values"].unbind(0)))
+        past_keys_values = [given[name] for name in _past(net.config)]
+        layers = net.config.n_layers
+        cache = KeyValueCache(past_keys_values[:layers], past_keys_values[layers:])
         for layer, block in enumerate(net.blocks):
             tokens = block(tokens, mask=seen, cache=cache, layer=layer)
         modes, logits = net.decode_controls(tokens[:, -1])
-        keys, values = torch.stack(cache.keys), torch.stack(cache.values)
-        return modes * net.control_scale, logits, keys, values
+        return modes * net.control_scale, logits, *cache.keys, *cache.values
 
 
 def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
@@ -135,16 +145,18 @@ def export_onnx(model: ART, path: str | Path, int8: bool = False) -> Path:
     if isinstance(model.net, MultiHypothesis):
         plain, inputs, outputs = _Plain(model.net), _INPUTS, _OUTPUTS
     else:
-        plain, inputs, outputs = _Step(model.net), _STEP_INPUTS, _STEP_OUTPUTS
         config = model.config
-        cached = torch.zeros(config.n_layers, 2, config.n_heads, 5, config.width // config.n_heads)
+        plain, inputs = _Step(model.net), _step_inputs(config)
+        outputs = ("controls", "logits", *(f"{name}_out" for name in _past(config)))
+        cached = torch.zeros(2, config.n_heads, 5, config.width // config.n_heads)
         known = torch.ones(5 + config.tokens_per_step, dtype=torch.bool)
         rows = torch.zeros(2)
         # Each input a tensor of its own: one that stood twice would be taken for one input.
         time = example[3]
         example += (example[0].clone(), rows - 0.2, rows, time.clone())
-        example += (torch.zeros(2, 3), time.clone(), cached, cached.clone(), known)
-        shapes += [{0: batch}] * 6 + [{1: batch, 3: past}] * 2
+        example += (torch.zeros(2, 3), time.clone())
+        example += (*(cached.clone() for _ in _past(config)), known)
+        shapes += [{0: batch}] * 6 + [{0: batch, 2: past} for _ in _past(config)]
         shapes.append({0: past + config.tokens_per_step})
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of axes that share a name, and of torchvision
@@ -246,10 +258,10 @@ class OnnxSteps:
         self._inputs = _arrays(problems)
         size, head = len(problems), config.width // config.n_heads
         # The runtime dislikes empty tensors: one token that nobody sees.
-        cached = np.zeros((config.n_layers, size, config.n_heads, 1, head), dtype=np.float32)
+        cached = np.zeros((size, config.n_heads, 1, head), dtype=np.float32)
+        self._past = _past(config)
         self._inputs |= {
-            "keys": cached,
-            "values": cached,
+            **dict.fromkeys(self._past, cached),
             "known": np.zeros(1, dtype=bool),
             "control": np.zeros((size, 3), dtype=np.float32),
             "control_time": self._inputs["final_time"],
@@ -261,14 +273,14 @@ class OnnxSteps:
     ) -> tuple[FloatArray, FloatArray]:
         """As :meth:`art_policy.generation.Steps.predict`."""
         inputs, tokens = self._inputs, self._tokens
-        moment = {"state": state, "returns": returns, "budget": budget, "time_to_go": time_to_go}
-        inputs |= {name: value.astype(np.float32) for name, value in moment.items()}
+        moment = zip(_MOMENT, (state, returns, budget, time_to_go))
+        inputs |= {name: value.astype(np.float32) for name, value in moment}
         known = np.ones(len(inputs["known"]) + tokens, dtype=bool)
         known[:-tokens] = inputs["known"]
         known[-tokens] = self._control_known
-        controls, logits, keys, values = self._session.run(None, {**inputs, "known": known})
+        controls, logits, *past = self._session.run(None, {**inputs, "known": known})
         last = self._longest
-        inputs |= {"keys": keys[:, :, :, -last:], "values": values[:, :, :, -last:]}
+        inputs |= {name: array[:, :, -last:] for name, array in zip(self._past, past)}
         inputs |= {"known": known[-last:], "control_time": inputs["time_to_go"]}
         return controls.astype(np.float64), logits
 

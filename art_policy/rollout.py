@@ -145,7 +145,7 @@ _COST_STEP = 0.05
 #: One with several modes is sampled at least so often, and asks for REL's cost each time: the first
 #: impulse decides on which side the obstacles are passed, and which samples pass them is seen at
 #: once.
-_N_SAMPLES = 8
+_N_SAMPLES = 16
 
 #: Steps of a guide that a model is made to begin with.
 _PROMPT = 16

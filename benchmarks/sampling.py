@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import functools
+import importlib
 import tempfile
 import time
 from collections.abc import Callable
@@ -127,7 +128,8 @@ def main() -> None:
         if options.onnx:
             exported = str(Path(folder) / "model.onnx")
             export_onnx(ART.from_pretrained(options.model), exported)
-        run = joblib.delayed(measure)
+        # By the module's name, which a worker can import; of __main__ it would know nothing.
+        run = joblib.delayed(importlib.import_module("benchmarks.sampling").measure)
         jobs = (run(options.model, options.guide, exported, *problem) for problem in problems)
         with joblib.parallel_config(backend="loky", inner_max_num_threads=1):
             found = joblib.Parallel(n_jobs=options.workers)(jobs)
